@@ -10,6 +10,7 @@ from collections.abc import Iterator
 import psycopg
 from psycopg.conninfo import make_conninfo
 
+from octasplat.service.client_addresses import client_group
 from octasplat.workers.db.connections import KEEPALIVES
 from octasplat.workers.db.events_and_logs import CHANNEL
 
@@ -30,6 +31,7 @@ class EventBroker:
         self._listen = listen
         self._subscribers: dict[uuid.UUID, set[asyncio.Event]] = {}
         self._owners: Counter[str] = Counter()
+        self._addresses: Counter[str] = Counter()
         self._closing = asyncio.Event()
 
     @property
@@ -40,6 +42,10 @@ class EventBroker:
     def count_of_owner(self, owner: str) -> int:
         """Return the number of an owner's waiting streams."""
         return self._owners[owner]
+
+    def count_of_address(self, address: str) -> int:
+        """Return the number of an address's waiting streams."""
+        return self._addresses[client_group(address)]
 
     @property
     def is_closing(self) -> bool:
@@ -52,22 +58,26 @@ class EventBroker:
         self._wake_all()
 
     @contextlib.contextmanager
-    def subscribe(self, job_id: uuid.UUID, owner: str) -> Iterator[asyncio.Event]:
+    def subscribe(self, job_id: uuid.UUID, owner: str, address: str) -> Iterator[asyncio.Event]:
         """Yield an event that is set whenever the job has new events, until the block ends.
 
         Args:
             job_id: the job.
             owner: whoever listens.
+            address: where from.
         """
+        group = client_group(address)
         event = asyncio.Event()
         self._subscribers.setdefault(job_id, set()).add(event)
         self._owners[owner] += 1
+        self._addresses[group] += 1
         try:
             yield event
         finally:
-            self._owners[owner] -= 1
-            if not self._owners[owner]:
-                del self._owners[owner]
+            for counter, name in ((self._owners, owner), (self._addresses, group)):
+                counter[name] -= 1
+                if not counter[name]:
+                    del counter[name]
             events = self._subscribers[job_id]
             events.discard(event)
             if not events:

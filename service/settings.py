@@ -88,6 +88,7 @@ class ServiceSettings(WorkerSettings):
         ping_seconds: how often a quiet stream of events gives a sign of life.
         max_streams: streams of events at once.
         max_streams_per_owner: of those of one owner.
+        max_streams_per_address: of those of one address; of IPv6, 64 bits count as one.
         max_connections: connections at once; fewer where the process may open few files. Where all are taken,
             a new one replaces the one that has waited longest for a request.
         max_connections_per_address: the same of one address; those of ``proxies`` may have all.
@@ -125,6 +126,7 @@ class ServiceSettings(WorkerSettings):
     ping_seconds: float = Field(15.0, gt=0)
     max_streams: int = Field(500, gt=0)
     max_streams_per_owner: int = Field(100, gt=0)
+    max_streams_per_address: int = Field(200, gt=0)
     max_connections: int = Field(4096, gt=0)
     max_connections_per_address: int = Field(1024, gt=0)
     header_seconds: float = Field(20.0, gt=0)

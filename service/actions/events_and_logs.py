@@ -49,19 +49,23 @@ async def read_events(
 
 
 async def follow_events(
-    service: Service, principal: Principal, job_id: uuid.UUID, *, after: int
+    service: Service, principal: Principal, job_id: uuid.UUID, *, after: int, address: str
 ) -> AsyncGenerator[JobEvent | None, None] | None:
     """Return the events of a job as they happen until it is over; None if all were sent already.
 
     In the place of an event comes None as a sign of life, where nothing has happened for a while.
 
     Raises:
-        ProblemError: 404, 429 with too many streams of the principal's owner, 503 with too many of all.
+        ProblemError: 404, 429 with too many streams of the principal's owner or of its address, 503 with too
+            many of all.
     """
     job = await read_job(service, principal, job_id)
     broker, settings = service.event_broker, service.settings
     if broker.count_of_owner(principal.owner) >= settings.max_streams_per_owner:
         detail = "You have too many streams open; close some, or poll GET /v1/jobs/{id} instead."
+        raise ProblemError(429, "streams", detail, retry_seconds=_RETRY_SECONDS)
+    if broker.count_of_address(address) >= settings.max_streams_per_address:
+        detail = "Your address has too many streams open; close some, or poll GET /v1/jobs/{id} instead."
         raise ProblemError(429, "streams", detail, retry_seconds=_RETRY_SECONDS)
     if broker.subscriber_count >= settings.max_streams:
         detail = "Too many streams are open; poll GET /v1/jobs/{id} instead."
@@ -70,17 +74,17 @@ async def follow_events(
         async with service.pool.connection() as connection:
             if not await list_job_events(connection, job_id, after, 1):
                 return None
-    return _stream_events(service, principal, job_id, after)
+    return _stream_events(service, principal, job_id, after, address)
 
 
 async def _stream_events(
-    service: Service, principal: Principal, job_id: uuid.UUID, after: int
+    service: Service, principal: Principal, job_id: uuid.UUID, after: int, address: str
 ) -> AsyncGenerator[JobEvent | None, None]:
     ping = service.settings.ping_seconds
     quiet = 0.0
     wait = min(ping, _ACCESS_CHECK_SECONDS if service.settings.listen else _POLL_SECONDS)
     checked_at = time.monotonic()
-    with service.event_broker.subscribe(job_id, principal.owner) as news:
+    with service.event_broker.subscribe(job_id, principal.owner, address) as news:
         while not service.event_broker.is_closing:
             news.clear()
             async with service.pool.connection() as connection:

@@ -5,12 +5,12 @@ from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import aclosing
 from typing import Annotated
 
-from fastapi import APIRouter, Header, Query, Response
+from fastapi import APIRouter, Header, Query, Request, Response
 from fastapi.responses import StreamingResponse
 from fastapi.sse import format_sse_event
 
 from octasplat.service.actions import events_and_logs as actions
-from octasplat.service.auth import Reader
+from octasplat.service.auth import Reader, client_address
 from octasplat.service.paging import LongLimit
 from octasplat.service.routes import problem_responses
 from octasplat.service.routes.parameters import JobId
@@ -60,7 +60,7 @@ async def read_timeline(
     },
 )
 async def stream_events(
-    job_id: JobId, principal: Reader, service: ServiceDep,
+    job_id: JobId, principal: Reader, service: ServiceDep, request: Request,
     last_event_id: Annotated[
         str | None, Header(max_length=40, description="Id of the last event that has arrived.")
     ] = None,
@@ -69,7 +69,8 @@ async def stream_events(
     """Stream the job's events; after a break, `Last-Event-ID` names the last one received."""
     if last_event_id is not None and last_event_id.isdecimal():
         after = min(int(last_event_id), (1 << 62) - 1)
-    events = await actions.follow_events(service, principal, job_id, after=after)
+    address = client_address(request)
+    events = await actions.follow_events(service, principal, job_id, after=after, address=address)
     if events is None:
         return Response(status_code=204)
     headers = {"Cache-Control": "no-cache", "X-Accel-Buffering": "no"}

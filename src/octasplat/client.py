@@ -13,6 +13,7 @@ from octasplat.notebook import default_progress, table_html
 from octasplat.paths import PathLike
 from octasplat.workers.client import submission
 from octasplat.workers.client.api import Api, ServiceError, ServiceUnreachableError, find_address, find_token
+from octasplat.workers.client.dataset_tasks import import_scene, is_web_address
 from octasplat.workers.client.submission import Derivation, JobFailedError, Submission
 
 JobState = Literal["queued", "running", "canceling", "succeeded", "failed", "canceled"]
@@ -80,7 +81,8 @@ class Client:
         """Upload photographs and queue their reconstruction; uploaded photographs are not sent again.
 
         Args:
-            photographs: a folder, a ZIP file, or the id of a dataset.
+            photographs: a folder, a ZIP file, the id of a dataset, or the https address of a ZIP file, which
+                the service fetches.
             label: what to call the job.
             queue: which workers.
             priority: higher goes first.
@@ -92,7 +94,7 @@ class Client:
             ServiceError: the service refuses the photographs or the options.
             Unreachable: nobody answers.
         """
-        what = Submission(Path(photographs), options, label, queue, priority)
+        what = Submission(_scene(photographs), options, label, queue, priority)
         return Job(self._api, submission.submit(self._api, what, progress or default_progress()))
 
     def derive(
@@ -114,7 +116,7 @@ class Client:
             source: the finished job, or its id; None for kinds that work on files alone, such as import.
             kind: of the new one; ``GET /v1/options`` lists them.
             files: files that the options name, by these names, or by their own.
-            photographs: a folder, a ZIP file, or the id of a dataset to work on in the place of the job's.
+            photographs: to work on in the place of the job's, as for :meth:`submit`.
             label: what to call the job.
             queue: which workers.
             priority: higher goes first.
@@ -136,12 +138,26 @@ class Client:
             kind,
             options,
             {name: Path(path) for name, path in named.items()},
-            None if photographs is None else Path(photographs),
+            None if photographs is None else _scene(photographs),
             label,
             queue,
             priority,
         )
         return Job(self._api, submission.derive(self._api, what, progress or default_progress()))
+
+    def import_scene(self, url: str, *, name: str | None = None, sha256: str | None = None) -> str:
+        """Let the service fetch photographs, and return the id of their dataset, which :meth:`submit` takes.
+
+        Args:
+            url: address of a ZIP file; https, and reachable from everywhere.
+            name: what to call the dataset; by default as the file.
+            sha256: what the ZIP file must be; then the same call again makes no second dataset.
+
+        Raises:
+            ServiceError: the address does not answer well, or the service refuses the photographs.
+            Unreachable: the service was away for two minutes.
+        """
+        return str(import_scene(self._api, url, name=name, sha256=sha256)["id"])
 
     def job(self, job_id: str) -> "Job":
         """Return the job with an id.
@@ -161,6 +177,11 @@ class Client:
 
     def __repr__(self) -> str:
         return f"Client({self.url!r})"
+
+
+def _scene(photographs: PathLike) -> Path | str:
+    """Return an address as text, anything else as a path."""
+    return str(photographs) if is_web_address(photographs) else Path(photographs)
 
 
 class Job:

@@ -112,7 +112,8 @@ def test_events_and_lines_of_both_versions_are_numbered_by_job(empty: str) -> No
     with psycopg.connect(empty) as connection:
         for job in jobs:
             connection.execute(
-                "INSERT INTO jobs (id, owner, kind, options, queue) VALUES (%s, 'me', 'x', '{}', 'cpu')", [job]
+                "INSERT INTO jobs (id, owner, kind, options, queue) VALUES (%s, 'me', 'x', '{}', 'cpu')",
+                [job],
             )
         add(connection)
         add(connection)

@@ -12,9 +12,16 @@ from octasplat.workers.storage.trees import TreeFile
 VIEWS = 6
 POINTS = 600_000
 MEMORY_BYTES = 900 << 20
-"""Some 0.6 GB of it are libraries; objects of Python for all points and observations would not fit beside them."""
+"""Some 0.6 GB of it are libraries; objects of Python for all points and observations do not fit in too."""
 _POINT = np.dtype(
-    [("id", "<u8"), ("xyz", "<f8", 3), ("color", "u1", 3), ("error", "<f8"), ("n", "<u8"), ("track", "<i4", 4)]
+    [
+        ("id", "<u8"),
+        ("xyz", "<f8", 3),
+        ("color", "u1", 3),
+        ("error", "<f8"),
+        ("n", "<u8"),
+        ("track", "<i4", 4),
+    ]
 )
 _KEYPOINT = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 

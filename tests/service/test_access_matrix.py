@@ -76,7 +76,10 @@ class Stage:
         assert tried.is_success, tried.text
         listed = await self.http.get(f"/v1/webhooks/{hook}/deliveries", headers=self.headers["owner"])
         self.ids |= {"webhook_id": hook, "delivery_id": listed.json()["deliveries"][0]["id"]}
-        self.mine = {"of-me", open_dataset, dataset, job_id, hook}
+        await self.http.post(f"/v1/datasets/{open_dataset}/commit", headers=self.headers["owner"])  # refused
+        tasks = await self.http.get(f"/v1/datasets/{open_dataset}/tasks", headers=self.headers["owner"])
+        self.ids["task_id"] = tasks.json()["tasks"][0]["id"]
+        self.mine = {"of-me", open_dataset, dataset, job_id, hook, self.ids["task_id"]}
         self.job = {"kind": "toy", "dataset_id": dataset}
 
     async def address(self, path: str) -> str:

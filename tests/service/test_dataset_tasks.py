@@ -94,7 +94,9 @@ async def test_faults_are_told_by_the_task_and_the_dataset_is_open_again(
         assert told.status_code == task["problem"]["status"] == 422
         assert task["state"] == "failed"
         for problem in (told.json(), task["problem"]):
-            assert problem["type"].endswith(":model-damaged") and problem["detail"] == "The model is cut short."
+            assert (
+                problem["type"].endswith(":model-damaged") and problem["detail"] == "The model is cut short."
+            )
             assert [fault["file"] for fault in problem["errors"]] == ["sparse/0/images.bin"]
         assert (await http.get(dataset)).json()["state"] == "open"
         check.error = None
@@ -200,7 +202,8 @@ async def test_import_ends_when_its_dataset_is_deleted(
 @pytest.mark.parametrize(
     ("prefer", "seconds"),
     [
-        (None, 20.0), ("", 20.0), ("return=minimal", 20.0), ("respond-async", 0.0), ("Respond-Async, wait=7", 7.0),
+        (None, 20.0), ("", 20.0), ("return=minimal", 20.0), ("respond-async", 0.0),
+        ("Respond-Async, wait=7", 7.0),
         ("wait=3;x=1", 3.0), ("wait=100000", 50.0), ("wait=-1", 20.0), ("wait=x", 20.0),
     ],
 )  # fmt: skip

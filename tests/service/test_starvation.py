@@ -95,6 +95,28 @@ async def test_commits_of_one_owner_take_turns_with_those_of_others(
             assert {answer.status_code for answer in await asyncio.gather(*commits)} == {200}
 
 
+async def test_streams_of_one_address_leave_room_for_others(connect_service: ConnectService) -> None:
+    """Whatever owners they are of; the one address of a proxy that is named counts as those behind it."""
+    settings = {"max_streams": 10, "max_streams_per_owner": 2, "max_streams_per_address": 3}
+    async with connect_service(**settings, proxies=("127.0.0.1",)) as (http, service):
+        bob = await client_with_token(service, "bob", "admin")
+        address = f"/v1/jobs/{(await new_job(http, service))['id']}/events"
+        here, elsewhere = {"X-Forwarded-For": "2001:db8::1"}, {"X-Forwarded-For": "192.0.2.1"}
+        asked = [here, here, {**bob, "X-Forwarded-For": "2001:db8::2"}]
+        streams = [asyncio.create_task(http.get(address, headers=headers)) for headers in asked]
+        try:
+            while service.event_broker.subscriber_count < 3:
+                await asyncio.sleep(0.01)
+            refused = await http.get(address, headers={**bob, **here})
+            assert refused.status_code == 429 and "address" in refused.json()["detail"]
+            streams.append(asyncio.create_task(http.get(address, headers={**bob, **elsewhere})))
+            while service.event_broker.subscriber_count < 4:
+                await asyncio.sleep(0.01)
+        finally:
+            service.event_broker.close()
+            await asyncio.gather(*streams)
+
+
 async def test_streams_of_one_owner_leave_room_for_others(connect_service: ConnectService) -> None:
     async with connect_service(max_streams=10, max_streams_per_owner=3) as (http, service):
         bob = await client_with_token(service, "bob", "admin")

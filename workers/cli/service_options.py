@@ -14,6 +14,21 @@ if TYPE_CHECKING:
 F = TypeVar("F", bound=Callable[..., Any])
 
 
+class SceneName(click.Path):
+    """A scene: a path, or the address of a ZIP file, which stays text."""
+
+    name = "scene"
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the path, or the address."""
+        from octasplat.workers.client.dataset_tasks import is_web_address
+
+        return value if is_web_address(value) else super().convert(value, param, ctx)
+
+
 def server_option(command: F) -> F:
     """Add the option ``--server`` to a command."""
     return click.option(

@@ -1,10 +1,19 @@
-"""Tasks of the service on datasets, waited for: commits, and files that it fetches from an address."""
+"""Tasks of the service on datasets, waited for: commits, and scenes that it fetches from an address."""
 
+import hashlib
 import time
+import uuid
+from pathlib import PurePosixPath
 from typing import Any
+from urllib.parse import urlsplit
 
-from octasplat.workers.client.api import Api, problem_error
+import httpx
 
+from octasplat.workers.client.api import Api, ServiceError, problem_error
+from octasplat.workers.client.backoff import Backoff
+
+MAX_CHECK_WAIT_SECONDS = 600.0
+"""For so long a check of a dataset that a front end of the former version has begun is waited for."""
 _FIRST_PAUSE_SECONDS, _LAST_PAUSE_SECONDS = 0.2, 3.0
 
 
@@ -23,3 +32,61 @@ def wait_for_task(api: Api, task: dict[str, Any]) -> dict[str, Any]:
     if (problem := task["problem"]) is not None:
         raise problem_error(problem, problem["status"])
     return task
+
+
+def commit(api: Api, dataset: dict[str, Any]) -> dict[str, Any]:
+    """Commit a dataset, however long its check takes; returns it.
+
+    Raises:
+        ServiceError: the service refuses it; the text names the files.
+    """
+    address, patience = f"/v1/datasets/{dataset['id']}", Backoff(MAX_CHECK_WAIT_SECONDS)
+    while dataset["state"] != "committed":
+        try:
+            response = api.post_response(f"{address}/commit")
+        except ServiceError as error:
+            if error.status != 409:
+                raise
+            dataset = api.get(address)
+            if dataset["state"] != "committed" and not patience.wait():
+                raise
+        else:
+            if response.status_code == httpx.codes.ACCEPTED:
+                wait_for_task(api, response.json())
+                dataset = api.get(address)
+            else:
+                dataset = response.json()
+    return dataset
+
+
+def is_web_address(scene: object) -> bool:
+    """Return whether a scene is named by an address that the service can fetch it from."""
+    return isinstance(scene, str) and scene.startswith(("https://", "http://"))
+
+
+def import_scene(api: Api, url: str, *, name: str | None = None, sha256: str | None = None) -> dict[str, Any]:
+    """Let the service fetch a scene, a ZIP file, and commit it.
+
+    Args:
+        api: the service.
+        url: where the ZIP file is; https, and reachable from everywhere.
+        name: what to call the dataset; by default as the file.
+        sha256: what the ZIP file must be; then the same call again makes no second dataset.
+
+    Returns:
+        The dataset.
+
+    Raises:
+        ServiceError: the address does not answer well, or the scene is refused.
+    """
+    name = name or PurePosixPath(urlsplit(url).path).stem
+    key = (
+        uuid.uuid4().hex
+        if sha256 is None
+        else hashlib.sha256(f"{url}\n{sha256}\n{name}".encode()).hexdigest()
+    )
+    dataset: dict[str, Any] = api.post("/v1/datasets", {"name": name[:200]}, key=f"import-{key}")
+    if dataset["state"] == "open":
+        task = api.post(f"/v1/datasets/{dataset['id']}/import", {"url": url, "sha256": sha256})
+        wait_for_task(api, task)
+    return commit(api, dataset)

@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from octasplat.engine.core.errors import ConfigError, OctasplatError
-from octasplat.engine.core.events import EventListener, Warned, ignore_events
+from octasplat.engine.core.events import EventListener, Noted, Warned, ignore_events
 from octasplat.engine.core.portable_names import name_or
 from octasplat.engine.core.progress import counted_phase
 from octasplat.engine.pathtracing.stage.sidecar_files import sidecar_files
@@ -15,6 +15,7 @@ from octasplat.engine.pathtracing.stage.stage_file import read_stage, referenced
 from octasplat.engine.render.path_document import read_path_document
 from octasplat.engine.settings.nested_options import merge_options
 from octasplat.workers.client.api import Api
+from octasplat.workers.client.dataset_tasks import import_scene, is_web_address
 from octasplat.workers.client.download import download_archive, download_results
 from octasplat.workers.client.upload import upload_files, upload_scene
 from octasplat.workers.client.watch import watch_job
@@ -31,18 +32,20 @@ class Submission:
     """Description of a job to submit.
 
     Attributes:
-        scene: folder of photographs, ZIP file, or the id of a dataset.
+        scene: folder of photographs, ZIP file, the id of a dataset, or the address of a ZIP file, as text.
         options: of the reconstruction.
         label: what to call the job.
         queue: which workers.
         priority: higher goes first.
+        sha256: what the ZIP file at an address must be.
     """
 
-    scene: Path
+    scene: Path | str
     options: Mapping[str, Any] = field(default_factory=dict)
     label: str | None = None
     queue: str = "cpu"
     priority: int = 0
+    sha256: str | None = None
 
 
 def submit(api: Api, submission: Submission, on_event: EventListener = ignore_events) -> dict[str, Any]:
@@ -57,7 +60,7 @@ def submit(api: Api, submission: Submission, on_event: EventListener = ignore_ev
         OctasplatError: the scene or the options are refused, or the service does not answer.
     """
     body = {
-        "dataset_id": _upload_if_needed(api, submission.scene, on_event),
+        "dataset_id": _upload_if_needed(api, submission.scene, on_event, submission.sha256),
         "options": dict(submission.options),
         "label": submission.label,
         "queue": submission.queue,
@@ -76,7 +79,7 @@ class Derivation:
         kind: of the job, such as ``render``; GET /v1/options has them.
         options: of the kind.
         files: files that the options name, by these names.
-        scene: photographs to work on instead of the finished job's: a folder, ZIP file or id of a dataset.
+        scene: photographs to work on instead of the finished job's: as those of :class:`Submission`.
         label: what to call the job.
         queue: which workers.
         priority: higher goes first.
@@ -86,7 +89,7 @@ class Derivation:
     kind: str
     options: Mapping[str, Any] = field(default_factory=dict)
     files: Mapping[str, Path] = field(default_factory=dict)
-    scene: Path | None = None
+    scene: Path | str | None = None
     label: str | None = None
     queue: str = "cpu"
     priority: int = 0
@@ -245,18 +248,26 @@ def download_job_archive(api: Api, job_id: str, path: Path, on_event: EventListe
         return download_archive(api, job_id, path, progress=lambda d, t: progress(d >> 10, t >> 10))
 
 
-def _upload_if_needed(api: Api, scene: Path, on_event: EventListener) -> str:
-    """Return the dataset of these photographs, sent if that is not done yet."""
+def _upload_if_needed(api: Api, scene: Path | str, on_event: EventListener, sha256: str | None = None) -> str:
+    """Return the dataset of these photographs, sent or fetched if that is not done yet."""
     dataset_id = _parse_id(str(scene))
     if dataset_id is not None:
         return dataset_id
+    if isinstance(scene, str) and is_web_address(scene):
+        on_event(Noted(f"The service fetches {scene}."))
+        return _told(import_scene(api, scene, sha256=sha256), on_event)
     with counted_phase("upload", on_event) as progress:
         dataset = upload_scene(
             api,
-            scene,
+            Path(scene),
             progress=lambda d, t: progress(d >> 10, t >> 10),
             on_warning=lambda sentence: on_event(Warned(sentence)),
         )
+    return _told(dataset, on_event)
+
+
+def _told(dataset: dict[str, Any], on_event: EventListener) -> str:
+    """Return the id of a dataset whose warnings are told."""
     for warning in dataset["facts"].get("warnings", ()):
         on_event(Warned(warning))
     return str(dataset["id"])

@@ -11,17 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import httpx
-
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.scene_layout import is_ignored_file
 from octasplat.workers.client.api import Api, ServiceError
-from octasplat.workers.client.backoff import Backoff
-from octasplat.workers.client.dataset_tasks import wait_for_task
+from octasplat.workers.client.dataset_tasks import commit
 
 PARALLEL_UPLOADS = 4
-MAX_CHECK_WAIT_SECONDS = 600.0
-"""For so long a check of a dataset that somebody else has begun is waited for."""
 MAX_DELETED_DATASETS = 30
 """So many datasets of one folder that were deleted are looked past for one that is there."""
 _PIECE_BYTES = 1 << 20
@@ -166,32 +161,6 @@ def upload_files(
     if dataset["state"] == "open":
         _send_missing(api, dataset["id"], local, progress)
     return commit(api, dataset)
-
-
-def commit(api: Api, dataset: dict[str, Any]) -> dict[str, Any]:
-    """Commit a dataset, however long its check takes; returns it.
-
-    Raises:
-        ServiceError: the service refuses it; the text names the files.
-    """
-    address, patience = f"/v1/datasets/{dataset['id']}", Backoff(MAX_CHECK_WAIT_SECONDS)
-    while dataset["state"] != "committed":
-        try:
-            response = api.post_response(f"{address}/commit")
-        except ServiceError as error:
-            if error.status != 409:
-                raise
-            dataset = api.get(address)
-            # A front end of the former version checks it, or did so until it was lost.
-            if dataset["state"] != "committed" and not patience.wait():
-                raise
-        else:
-            if response.status_code == httpx.codes.ACCEPTED:
-                wait_for_task(api, response.json())
-                dataset = api.get(address)
-            else:
-                dataset = response.json()
-    return dataset
 
 
 def _find_or_create_dataset(

@@ -4,8 +4,9 @@ import copy
 import json
 import re
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 import click
 
@@ -16,6 +17,7 @@ from octasplat.workers.cli.options import exports_option, parse_export_names
 from octasplat.workers.cli.printing import Printer, output_options
 from octasplat.workers.cli.request_options import request_from_options, request_options
 from octasplat.workers.cli.service_options import (
+    SceneName,
     connected,
     job_options,
     server_option,
@@ -28,13 +30,19 @@ if TYPE_CHECKING:
 
 
 @click.command(short_help="Send a scene to the service and queue its reconstruction.")
-@click.argument("scene", type=click.Path(path_type=Path))
+@click.argument("scene", type=SceneName())
+@click.option(
+    "--sha256",
+    metavar="HEX",
+    help="Where SCENE is an address: what the ZIP file must be; then it is fetched once only.",
+)
 @wait_options
 @request_options(ReconstructOptions)
 @job_options
 @output_options
 def submit(
-    scene: Path,
+    scene: Path | str,
+    sha256: str | None,
     wait: bool,
     output: Path | None,
     label: str | None,
@@ -46,7 +54,8 @@ def submit(
 ) -> None:
     """Send SCENE: a folder with images/ (and sparse/0), one of photographs, a ZIP file or a dataset's id.
 
-    The same command goes on with an upload that broke off.
+    The same command goes on with an upload that broke off. The service itself fetches a ZIP file from a
+    public https address: octasplat submit https://example.org/fox.zip
     """
     from octasplat.workers.cli.remote_jobs import submit, submit_and_wait
     from octasplat.workers.client.submission import Submission
@@ -55,11 +64,11 @@ def submit(
     options: ReconstructOptions = request_from_options(ReconstructOptions, given)
     options.config()  # what cannot be used is refused before anything is sent
     requested = options.model_dump(mode="json", exclude_unset=True)
-    what = Submission(scene, requested, label, queue, priority)
+    what = Submission(scene, requested, label, queue, priority, sha256)
     with connected(server, awaits_start=True) as api:
         what = replace(what, scene=_as_dataset(api, scene))
         if wait:
-            submit_and_wait(api, what, output or Path(f"{scene.stem or 'scene'}-result"), printer)
+            submit_and_wait(api, what, output or Path(f"{_stem(scene)}-result"), printer)
             return
         job = submit(api, what, printer)
     printer.print(job, [job["id"]], quiet_lines=[job["id"]])
@@ -98,9 +107,10 @@ def submit(
 )
 @click.option(
     "--other-dataset",
-    type=click.Path(path_type=Path),
+    type=SceneName(),
     metavar="DATASET",
-    help="Evaluate: measure all photographs of this folder, ZIP file or dataset in the same world instead.",
+    help="Evaluate: measure all photographs of this folder, ZIP file, dataset or address in the same world "
+    "instead.",
 )
 @click.option("--on", "former_on", type=click.Path(path_type=Path), hidden=True)
 @set_option
@@ -113,7 +123,7 @@ def derive(
     stage: Path | None,
     path_file: Path | None,
     environments: tuple[Path, ...],
-    other_dataset: Path | None,
+    other_dataset: Path | str | None,
     former_on: Path | None,
     wait: bool,
     output: Path | None,
@@ -194,12 +204,20 @@ def retry(job_id: str, from_start: bool, server: str | None, printer: Printer, *
         click.echo(f"Note: {note}", err=True)
 
 
-def _as_dataset(api: "Api", scene: Path) -> Path:
-    """Return the whole id of a dataset that is named by the end of it; a path as it is.
+def _stem(scene: Path | str) -> str:
+    """Return what to call the results of a scene."""
+    path = PurePosixPath(urlsplit(scene).path) if isinstance(scene, str) else scene
+    return path.stem or "scene"
+
+
+def _as_dataset(api: "Api", scene: Path | str) -> Path | str:
+    """Return the whole id of a dataset that is named by the end of it; a path or address as it is.
 
     Raises:
         ConfigError: the path is that of a video.
     """
+    if isinstance(scene, str):
+        return scene
     from octasplat.engine.dataset.video_frames import is_video
     from octasplat.workers.client.short_ids import SHOWN_CHARACTERS, find_dataset
 
