@@ -14,7 +14,7 @@ from octasplat.engine.gaussians.channels import stack_channels
 from octasplat.engine.gaussians.materials import MATERIAL_WIDTHS, has_materials
 from octasplat.engine.gaussians.merge import merge_scenes
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
-from octasplat.engine.pathtracing.kernels.gaussian_layer import AMBIENT, RELIT, SHADOWED
+from octasplat.engine.pathtracing.kernels.gaussian_layer import ADDITIVE, AMBIENT, RELIT, SHADOWED
 from octasplat.engine.pathtracing.kernels.gaussian_surface import ALBEDO, FEATURE_COUNT, MATERIAL, RAY_OFFSET
 from octasplat.engine.pathtracing.mesh_shapes import rotation_matrix
 from octasplat.engine.pathtracing.stage.model import Stage, StageGaussians
@@ -22,7 +22,7 @@ from octasplat.engine.trace.facing_normals import face_viewer
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import Tracer, TraceResult, TraceSettings
 
-BASE_FEATURE_COUNT = 3
+BASE_FEATURE_COUNT = 4
 SHADOW_BIAS_FRACTION = 0.03
 RAY_OFFSET_FRACTION = 0.5
 """Rays leave a surface of Gaussians so far above it, of their standard deviations."""
@@ -141,7 +141,7 @@ def place_gaussians(gaussians: FlatGaussians, placement: StageGaussians) -> Flat
 def _layer_features(gaussians: FlatGaussians, scene: StageGaussians) -> Float32[np.ndarray, "n f"]:
     values = np.zeros((len(gaussians), FEATURE_COUNT), np.float32)
     if scene.light == "shadowed":
-        values[:, SHADOWED] = 1.0 - scene.ambient
+        values[:, SHADOWED], values[:, ADDITIVE] = 1.0 - scene.ambient, 1.0
     elif scene.light == "relit":
         values[:, RELIT], values[:, AMBIENT] = 1.0, scene.ambient
     return values

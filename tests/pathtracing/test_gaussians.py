@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from octasplat.engine.core.color import linear_to_srgb, srgb_to_linear
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
 from octasplat.engine.pathtracing.compile_meshes import compile_meshes
 from octasplat.engine.pathtracing.gaussian_layers import build_gaussian_layers
@@ -142,9 +143,27 @@ def test_mirror_shows_gaussians_of_virtual_camera() -> None:
     assert direct.std() > 0.05
     shown = picture(emissive(mirror), into, some, background=((0.3 + 0.055) / 1.055) ** 2.4)
     assert psnr(shown, direct) > 50
-    # A mirror that takes a hair of the light composites by the other rule, and shows the same but for that.
-    dimmer = StageMesh(**(dict(mirror) | {"material": Mirror(color_srgb=(0.999, 0.999, 0.999))}))
-    assert psnr(picture(emissive(dimmer), into, some, background=((0.3 + 0.055) / 1.055) ** 2.4), direct) > 50
+
+
+@pytest.mark.parametrize("light", ["emissive", "shadowed"])
+def test_mirror_that_absorbs_dims_what_perfect_mirror_shows(light: str) -> None:
+    some = cloud(300, centre=(0, 0, -1.5))
+    into = camera((0.1, 0.05, 0.2), (0, 0, 1), (48, 36), 60)
+    numbers = Integrator(samples=64, anti_aliasing=True)  # outlines are where the rules of compositing differ
+
+    def mirrored(reflectance: float) -> np.ndarray:
+        color = ((1.055 * reflectance ** (1 / 2.4) - 0.055),) * 3
+        mirror = StageMesh(
+            shape="plane", rotation_degrees=(90, 0, 0), position=(0, 0, 1), scale=9,
+            material=Mirror(color_srgb=color),
+        )  # fmt: skip
+        stage = Stage(gaussians=(StageGaussians(light=light),), meshes=(mirror,), integrator=numbers)
+        return picture(stage, into, some, background=((0.3 + 0.055) / 1.055) ** 2.4)
+
+    perfect = mirrored(1.0)
+    assert psnr(mirrored(0.999), perfect) > 60
+    half = linear_to_srgb(0.5 * srgb_to_linear(perfect))
+    assert psnr(mirrored(0.5), half) > 45
 
 
 @pytest.mark.parametrize("light", ["directional", "point", "rectangle"])

@@ -16,7 +16,7 @@ from octasplat.engine.pathtracing.kernels.path_args import (
 )
 from octasplat.engine.pathtracing.kernels.principled_bsdf import orthonormal_basis
 from octasplat.engine.pathtracing.kernels.sampler import fill_pairs, pixel_key
-from octasplat.engine.pathtracing.kernels.scatter import FLAG_CAMERA_RAY, FLAG_LOSSLESS
+from octasplat.engine.pathtracing.kernels.scatter import FLAG_CAMERA_RAY, FLAG_CLEAR
 from octasplat.engine.pathtracing.kernels.surface import normalize
 from octasplat.engine.trace.kernels.native import njit_no_refcount
 
@@ -121,4 +121,4 @@ def start_paths(
             t = camera.focus_distance / max(forward, 1e-6)
             o_x, o_y, o_z = o_x + l_x, o_y + l_y, o_z + l_z
             d_x, d_y, d_z = normalize(t * d_x - l_x, t * d_y - l_y, t * d_z - l_z)
-        reset_path(paths, k, (o_x, o_y, o_z), (d_x, d_y, d_z), FLAG_LOSSLESS | FLAG_CAMERA_RAY)
+        reset_path(paths, k, (o_x, o_y, o_z), (d_x, d_y, d_z), FLAG_CLEAR | FLAG_CAMERA_RAY)

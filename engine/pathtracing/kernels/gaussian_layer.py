@@ -3,9 +3,9 @@
 How display colors and linear light meet. The trained colors of Gaussians are display values and are
 composited as such, into one layer of premultiplied color g and transmittance T for each ray.
 
-- On the camera's own ray, and on as long as mirrors and glass pass on all of it in one direction, layers are
-  composited with each other and over what is behind them in display values: g + T encode(L), L the mean
-  linear radiance of what is behind.
+- On the camera's own ray, and on as long as mirrors and glass send what they pass on in one direction, layers
+  are composited with each other and over what is behind them in display values: g + T encode(L), L the mean
+  linear radiance of what is behind. Mirrors dim the color of a layer, as linear light.
 - On any other ray a layer sends the linear radiance (1 - T) decode(g / (1 - T)) and lets T of the linear
   light behind it through. Where such a ray comes straight from a mirror or from glass and ends in the
   surroundings, what is behind the layer is known, and the radiance is decode(g + T encode(L)) as for the
@@ -38,7 +38,7 @@ from octasplat.engine.pathtracing.kernels.path_args import (
 from octasplat.engine.pathtracing.kernels.path_radiance import add_radiance, eval_background
 from octasplat.engine.pathtracing.kernels.sampler import uniform_pair
 from octasplat.engine.pathtracing.kernels.scatter import (
-    FLAG_LOSSLESS,
+    FLAG_CLEAR,
     LAYER_LIGHT_SAMPLE,
     LIGHT_CHOICE_SAMPLE,
     SHADOW_RAY_SCALE,
@@ -48,8 +48,9 @@ from octasplat.engine.trace.kernels.native import njit_no_refcount
 
 MIN_COVERAGE = 1e-6
 SINGLE_SURFACE_TOLERANCE = 0.05
-SHADOWED, RELIT, AMBIENT = 0, 1, 2
-"""Features of Gaussians: share that shadows take, share that is relit, and that times its ambient part."""
+SHADOWED, RELIT, AMBIENT, ADDITIVE = 0, 1, 2, 3
+"""Features of Gaussians: share that shadows take, share that is relit, that times its ambient part, and share
+that new lights are added to."""
 
 
 class LayerLight(NamedTuple):
@@ -87,6 +88,14 @@ def decode_srgb(display: float) -> float:
 
 
 @njit_no_refcount(forceinline=True)
+def _mirrored_color(color_srgb: float, share: float, reflectance: float) -> float:
+    """Return a premultiplied display color of coverage ``share`` in mirrors of a linear reflectance."""
+    if reflectance == 1.0:
+        return color_srgb
+    return share * encode_srgb(reflectance * decode_srgb(color_srgb / share))
+
+
+@njit_no_refcount(forceinline=True)
 def _layer_distance(layer: LayerArrays, k: int, share: float) -> float:
     """Return where a layer of coverage ``share`` lies.
 
@@ -110,7 +119,7 @@ def _layer_throughput(
     absorption: Float64[np.ndarray, "m 3"],
 ) -> Rgb:
     """Return what one unit of a layer's light counts: of its coverage on clear paths, else of its color."""
-    if paths.flags[p] & FLAG_LOSSLESS != 0:
+    if paths.flags[p] & FLAG_CLEAR != 0:
         g_r = g_g = g_b = paths.transmittance[p] * share
         return g_r, g_g, g_b
     w = paths.throughput[p]
@@ -133,16 +142,16 @@ def _query_layer_light(
     point: Vec3,
     normal: Vec3,
     weight: Rgb,
-    shadowed: float,
-    relit: float,
+    shares: tuple[float, float, float],
     query: LightQuery,
 ) -> None:
     """Queue a light query of a layer of Gaussians.
 
-    ``weight`` is what one unit of the layer's light counts, ``shadowed`` the share of it that shadows take,
-    and ``relit`` the share that the lights give.
+    ``weight`` is what one unit of the layer's light counts, ``shares`` are those that shadows take, that all
+    lights give, and that new lights are added to.
     """
     lights, shadows, k = query.lights, query.shadows, query.k
+    shadowed, relit, additive = shares
     (x, y, z), (g_r, g_g, g_b) = point, weight
     _, pick = uniform_pair(paths.keys[p], paths.samples[p], first_pair + LIGHT_CHOICE_SAMPLE)
     l, chance = sample_light_index(lights, x, y, z, pick)
@@ -152,7 +161,7 @@ def _query_layer_light(
     w_x, w_y, w_z, reach, l_r, l_g, l_b, pdf = sample_light(lights, l, x, y, z, u, v)
     n_x, n_y, n_z = normalize(normal[0], normal[1], normal[2])
     cosine = max(n_x * w_x + n_y * w_y + n_z * w_z, 0.0)
-    taking = relit + (shadowed if lights.adds_light[l] else 0.0)
+    taking = relit + (additive if lights.adds_light[l] else 0.0)
     factor = taking * cosine / (math.pi * chance * (pdf if pdf > 0.0 else 1.0))
     shadows.radiance_linear[k, 0] = g_r * l_r * factor
     shadows.radiance_linear[k, 1] = g_g * l_g * factor
@@ -191,9 +200,10 @@ def intersect_gaussian_layers(
         if share <= MIN_COVERAGE:
             continue
         d, o = paths.directions_world[p], paths.origins_world[p]
-        clear = paths.flags[p] & FLAG_LOSSLESS != 0
+        clear = paths.flags[p] & FLAG_CLEAR != 0
         features = layer.features[k]
-        shadowed, relit = features[SHADOWED] / share, features[RELIT] / share
+        shares = features[SHADOWED] / share, features[RELIT] / share, features[ADDITIVE] / share
+        relit = shares[1]
         base = 1.0 - relit + features[AMBIENT] / share
         distance = _layer_distance(layer, k, share)
         b_r, b_g, b_b = eval_background(
@@ -201,17 +211,18 @@ def intersect_gaussian_layers(
         )
         # --- what one unit of the layer's light counts, and how its color is lit ---
         g_r, g_g, g_b = _layer_throughput(paths, p, layer, k, share, distance, absorption)
-        lit_by_stage = shadowed > MIN_COVERAGE or relit > MIN_COVERAGE
-        if lit_by_stage and len(lights.kinds):
+        if max(shares[0], shares[1], shares[2]) > MIN_COVERAGE and len(lights.kinds):
             point = o[0] + distance * d[0], o[1] + distance * d[1], o[2] + distance * d[2]
             first_pair = CAMERA_SAMPLE_PAIRS + depth * SAMPLE_PAIRS_PER_BOUNCE
             normal = layer.normals[k, 0], layer.normals[k, 1], layer.normals[k, 2]
             query = LightQuery(lights, integrator, shadows, k)
-            _query_layer_light(paths, p, first_pair, point, normal, (g_r, g_g, g_b), shadowed, relit, query)
+            _query_layer_light(paths, p, first_pair, point, normal, (g_r, g_g, g_b), shares, query)
         # --- clear paths: layers are composited in display values ---
         if clear:
             for channel in range(3):
-                paths.layer_srgb[p, channel] += paths.transmittance[p] * layer.rgb[k, channel]
+                paths.layer_srgb[p, channel] += paths.transmittance[p] * _mirrored_color(
+                    layer.rgb[k, channel], share, paths.throughput[p, channel]
+                )
             paths.shading_factor[p, 0] += g_r * base
             paths.shading_factor[p, 1] += g_g * base
             paths.shading_factor[p, 2] += g_b * base
@@ -223,7 +234,8 @@ def intersect_gaussian_layers(
                 paths.is_alive[p], faces[k] = False, PATH_ENDED
             continue
         # --- other paths: the layer's linear radiance, over what is behind it where that is known ---
-        known = faces[k] < 0 and paths.pdf[p] == 0.0 and not lit_by_stage and paths.medium_ids[p] < 0
+        # What lights add to it or take from it is asked apart; a relit color has another base.
+        known = faces[k] < 0 and paths.pdf[p] == 0.0 and relit <= MIN_COVERAGE and paths.medium_ids[p] < 0
         if known:
             w, rgb = paths.throughput[p], layer.rgb[k]
             add_radiance(
@@ -257,7 +269,7 @@ def add_layer_light(
             reached = light.mesh_transmittance[k, channel] * light.caster_transmittance[k]
             taken = light.other_transmittance[k] * (1.0 - reached)
             amount = light.radiance[k, channel] * reached + light.occluded_radiance[k, channel] * taken
-            if paths.flags[p] & FLAG_LOSSLESS:
+            if paths.flags[p] & FLAG_CLEAR:
                 paths.shading_factor[p, channel] += amount
             else:
                 paths.radiance_linear[p, channel] += amount

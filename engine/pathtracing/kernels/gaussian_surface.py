@@ -47,12 +47,12 @@ from octasplat.engine.pathtracing.kernels.scatter import (
 from octasplat.engine.pathtracing.kernels.surface import normalize
 from octasplat.engine.trace.kernels.native import njit_no_refcount
 
-MATERIAL, ALBEDO, METALLIC, ROUGHNESS, RAY_OFFSET = 3, 4, 7, 8, 9
+MATERIAL, ALBEDO, METALLIC, ROUGHNESS, RAY_OFFSET = 4, 5, 8, 9, 10
 """Features of Gaussians behind those of :mod:`octasplat.engine.pathtracing.kernels.gaussian_layer`.
 
 Whether they have a material, this, and how far off their surface rays begin, world units.
 """
-FEATURE_COUNT = 10
+FEATURE_COUNT = 11
 IOR = 1.5
 """Of what is no metal: it reflects 0.04 head-on."""
 FIRST_PAIR, PAIRS_PER_BOUNCE = 1 << 12, 5

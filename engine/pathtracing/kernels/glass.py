@@ -13,7 +13,7 @@ from octasplat.engine.pathtracing.kernels.rough_dielectric import (
 from octasplat.engine.pathtracing.kernels.scatter import (
     DIRECTION_SAMPLE,
     FLAG_CAMERA_RAY,
-    FLAG_LOSSLESS,
+    FLAG_CLEAR,
     FLAG_SCATTERED,
     LOBE_SAMPLE,
     draw_light,
@@ -50,8 +50,6 @@ def scatter_mirror(paths: PathArrays, p: int, point: SurfacePoint, reflectance: 
     r_x, r_y, r_z = reflect(d[0], d[1], d[2], s_x, s_y, s_z)
     if r_x * n_x + r_y * n_y + r_z * n_z <= 0.0:
         r_x, r_y, r_z = reflect(d[0], d[1], d[2], n_x, n_y, n_z)
-    if red != 1.0 or green != 1.0 or blue != 1.0:
-        paths.flags[p] &= ~FLAG_LOSSLESS
     paths.flags[p] &= ~FLAG_CAMERA_RAY
     paths.throughput[p, 0] *= red
     paths.throughput[p, 1] *= green
@@ -76,7 +74,7 @@ def scatter_smooth_glass(
     cosine = -(d[0] * s_x + d[1] * s_y + d[2] * s_z)
     share, cos_t = fresnel_dielectric(min(cosine, 1.0), eta)
     if share < 1.0 and eta != 1.0:
-        paths.flags[p] &= ~FLAG_LOSSLESS
+        paths.flags[p] &= ~FLAG_CLEAR
     if eta != 1.0 and choice < share:
         scatter_mirror(paths, p, point, (1.0, 1.0, 1.0))
         return
@@ -84,7 +82,7 @@ def scatter_smooth_glass(
     plain = tint[0] == 1.0 and tint[1] == 1.0 and tint[2] == 1.0
     absorbs = materials.absorption[m, 0] + materials.absorption[m, 1] + materials.absorption[m, 2] > 0.0
     if not plain or absorbs:
-        paths.flags[p] &= ~FLAG_LOSSLESS
+        paths.flags[p] &= ~FLAG_CLEAR
     for channel in range(3):
         paths.throughput[p, channel] *= tint[channel]
     t_x, t_y, t_z = float(d[0]), float(d[1]), float(d[2])
@@ -172,7 +170,7 @@ def scatter_rough_glass(
     through = i_z < 0.0
     for channel in range(3):
         paths.throughput[p, channel] *= gain * value / pdf * (tint[channel] if through else 1.0)
-    paths.flags[p] = (paths.flags[p] | FLAG_SCATTERED) & ~(FLAG_LOSSLESS | FLAG_CAMERA_RAY)
+    paths.flags[p] = (paths.flags[p] | FLAG_SCATTERED) & ~(FLAG_CLEAR | FLAG_CAMERA_RAY)
     w_x, w_y, w_z = normalize(w_x, w_y, w_z)
     if through:
         paths.medium_ids[p] = m if is_entering else -1

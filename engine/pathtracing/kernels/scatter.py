@@ -34,8 +34,8 @@ from octasplat.engine.pathtracing.kernels.principled_bsdf import (
 from octasplat.engine.pathtracing.kernels.surface import normalize
 from octasplat.engine.trace.kernels.native import njit_no_refcount
 
-FLAG_LOSSLESS = 1
-"""Mark: every surface so far passed on all light in one direction; the first layer goes on."""
+FLAG_CLEAR = 1
+"""Mark: every surface so far sent all that it passed on in one direction; the first layer goes on."""
 FLAG_SCATTERED = 2
 """Mark: the path has left a matt or rough surface."""
 FLAG_CAMERA_RAY = 4
@@ -131,7 +131,13 @@ def draw_light(lights: LightArrays, point: Vec3, samples: PathSamples) -> LightS
 
 @njit_no_refcount(forceinline=True)
 def survives_roulette(paths: PathArrays, p: int, roulette: float) -> bool:
-    """Play russian roulette: terminate a path by its throughput; returns whether it continues."""
+    """Play russian roulette: terminate a path by its throughput; returns whether it continues.
+
+    Clear paths continue: what they see is composited in display values, in which a mean of some is not that
+    of all.
+    """
+    if paths.flags[p] & FLAG_CLEAR != 0:
+        return True
     w = paths.throughput[p]
     stay = min(max(w[0], w[1], w[2]), 0.95)
     if roulette >= stay:
@@ -212,6 +218,6 @@ def scatter_path(
     paths.throughput[p, 0] *= f_r / pdf
     paths.throughput[p, 1] *= f_g / pdf
     paths.throughput[p, 2] *= f_b / pdf
-    paths.flags[p] = (paths.flags[p] | FLAG_SCATTERED) & ~(FLAG_LOSSLESS | FLAG_CAMERA_RAY)
+    paths.flags[p] = (paths.flags[p] | FLAG_SCATTERED) & ~(FLAG_CLEAR | FLAG_CAMERA_RAY)
     w_x, w_y, w_z = normalize(w_x, w_y, w_z)
     spawn_ray(paths, p, x, y, z, w_x, w_y, w_z, pdf)
