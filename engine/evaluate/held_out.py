@@ -32,14 +32,12 @@ from octasplat.engine.pathtracing.relighting.path_relighter import Relighter
 from octasplat.engine.render.file_names import unique_render_names
 from octasplat.engine.render.image_files import write_png
 from octasplat.engine.render.renderer import background_color, front_normals
-from octasplat.engine.render.supersampling import render_filtered
+from octasplat.engine.render.supersampling import RADIANCE_RAYS_PER_SIDE, render_filtered
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import Tracer, TraceSettings
 from octasplat.engine.train.shading_factory import find_background, shading_for_view
 
-SIDE = 2
-"""So many rays across a pixel, and as many down, where a shading model shades; else one at its centre."""
 RENDERS, LAYERS, METRICS, REPORT = "renders", "layers", "metrics.json", "report.html"
 
 
@@ -148,7 +146,9 @@ def _render_views(
     for index in dataset.test_indices:
         rgb, alpha, weight = dataset.view_image(int(index))
         rays = dataset.view_rays(int(index))
-        image = render_filtered(tracer, rays, color, shading_for_view(shading, int(index)), SIDE)
+        image = render_filtered(
+            tracer, rays, color, shading_for_view(shading, int(index)), RADIANCE_RAYS_PER_SIDE
+        )
         if measures is not None:
             image = replace(image, normal_world=front_normals(tracer, rays, image.depth_median))
             view = dataset.views[index]

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -26,11 +25,11 @@ from octasplat.engine.gaussians.materials import has_materials
 from octasplat.engine.pathtracing.environment import EnvironmentMap, environment_frame
 from octasplat.engine.pathtracing.relighting.split_sum_relighter import SplitSumRelighter
 from octasplat.engine.poses.find_poses import read_pose_record
-from octasplat.engine.render.environment_files import read_background_map, read_environment
+from octasplat.engine.render.environment_files import read_environment
 from octasplat.engine.render.renderer import background_color
 from octasplat.engine.runs.config import ReconstructionConfig, read_config
+from octasplat.engine.runs.finished_shading import finished_shading
 from octasplat.engine.runs.run_folder import (
-    BACKGROUND,
     CACHE,
     CONFIG,
     EVALUATIONS,
@@ -42,17 +41,9 @@ from octasplat.engine.runs.run_folder import (
     open_run_dataset,
     photographs_folder,
     run_environment,
-    run_exposures,
 )
-from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.factory import make_tracer
-from octasplat.engine.train.shading_factory import (
-    ShadingOptions,
-    find_background,
-    find_deferred,
-    find_exposures,
-    make_shading,
-)
+from octasplat.engine.train.shading_factory import ShadingOptions
 
 SCALES = "scales.json"
 ESTIMATED_EXPOSURE_NOTE = (
@@ -142,7 +133,9 @@ def evaluate_scales(
     _check_coordinates(output, dataset, photographs_folder(output, scene))
     gaussians, _ = read_gaussian_ply(output / SCENE)
     extent = _extent_world(output, dataset)
-    shading = finished_shading(output, ShadingOptions.from_config(config.train), dataset, extent)
+    shading = finished_shading(
+        output, ShadingOptions.from_config(config.train), extent, [view.name for view in dataset.views]
+    )
     tracer = make_tracer(config.train.trace, threads=threads)
     tracer.build(gaussians, shading.features(gaussians))
     with counted_phase("evaluate", listener, len(dataset.test_indices)) as progress:
@@ -231,7 +224,10 @@ def measure_run(
         into or output,
         settings=config.train.trace,
         shading=finished_shading(
-            output, ShadingOptions.from_config(config.train), dataset, extent, exposed=into is None
+            output,
+            ShadingOptions.from_config(config.train),
+            extent,
+            [view.name for view in dataset.views] if into is None else (),
         ),
         background=config.evaluation_background,
         run={
@@ -265,34 +261,6 @@ def _find_ground_truth(dataset: Dataset, progress: EventListener, *, needed: boo
             raise
         progress(Warned(f"{error} Nothing is measured against it."))
         return None
-
-
-def finished_shading(
-    output: Path, options: ShadingOptions, dataset: Dataset, extent_world: float, *, exposed: bool = True
-) -> ShadingModel:
-    """Return the shading model of a finished run with its environment, background and exposures.
-
-    Args:
-        output: folder of the run.
-        options: what it learnt; of exposures, what its record says.
-        dataset: photographs.
-        extent_world: of the scene.
-        exposed: whether the photographs are those of the run, whose exposures are known or guessed.
-
-    Raises:
-        ConfigError: the run learnt one of these and its file is missing or damaged.
-    """
-    known = run_exposures(output)
-    shading = make_shading(
-        replace(options, learns_exposure=known is not None), len(dataset.views), extent_world
-    )
-    if (deferred := find_deferred(shading)) is not None:
-        deferred.light.set_radiance(read_environment(run_environment(output)))
-    if (background := find_background(shading)) is not None:
-        background.set_map(read_background_map(output / BACKGROUND))
-    if exposed and known is not None and (exposures := find_exposures(shading)) is not None:
-        exposures.load_known([view.name for view in dataset.views], known)
-    return shading
 
 
 def _read_run_environment(output: Path, up_world: tuple[float, float, float]) -> EnvironmentMap | None:

@@ -98,7 +98,7 @@ def run(
     notes = [f"{source}: {count:,} of {len(chosen):,} Gaussians changed."]
     if not has_known_light(source):
         notes.append(
-            "Viewers and octasplat render show their harmonics, which are as before; relight shows it."
+            "Viewers show their harmonics, which are as before; octasplat relight shows the materials."
         )
     mesh = {"mesh": request.mesh.name} if request.mesh is not None else {}
     masks = {"masks": [path.name for path in request.masks]} if request.masks else {}

@@ -61,6 +61,12 @@ class RenderOptions(PictureOptions):
         "describes: an object, or the text of a stage file. The files that it names are those of the job's "
         "files_id.",
     )
+    shading: Annotated[Literal["materials", "harmonics"] | None, ADVANCED] = Field(
+        None,
+        description="Colors of the Gaussians: their materials in the light that the run has learnt, or their "
+        "harmonics, which are faster and show no sharp reflections.  [default: materials, of a run that has "
+        "them]",
+    )
     preview: Annotated[bool, ADVANCED] = Field(
         False, description="Stage: render the first image only, to one file, finer and finer."
     )
@@ -78,6 +84,8 @@ class RenderOptions(PictureOptions):
                 if getattr(self, name):
                     raise ValueError(f"`{name}` goes with `stage`")
             return self
+        if self.shading is not None:
+            raise ValueError("`shading` goes without `stage`, in which `light` says how Gaussians are lit")
         if self.background == "transparent":
             raise ValueError("a stage is transparent in EXR only, which has alpha on any background")
         if (self.layers or self.stage.integrator.layers) and self.format != "exr":
@@ -200,6 +208,7 @@ def run(
         dataset=request.dataset,
         max_side=max_side,
         full_size=request.stage is not None,
+        shading=request.shading if request.stage is None else "harmonics",
     )
     cameras = requested_cameras(request, source)
     shots = requested_views(request, source) if cameras is None else camera_shots(cameras)
@@ -228,21 +237,25 @@ def _render_plain(plan: _RenderPlan, progress: EventListener, threads: int) -> t
     transparent = request.background == "transparent"
     background = background_color("black" if transparent else request.background or source.background)
     learnt = None if request.background else source.learnt  # another color was asked for, or alpha
+    materials = source.materials
     views = None if cameras is not None else (source.viewpoints, source.near_world)
     finished = output.finished_images(
         render_digest(
             source.gaussians, source.settings, background, transparent, cameras, None, views,
             source.trained_rad, None if learnt is None else learnt.rgb_srgb, *output.numbered(shots),
+            *(() if materials is None else (materials.settings, materials.light.radiance_linear)),
         )
     )  # fmt: skip
+    shading = materials or learnt or PLAIN_SHADING
     tracer = make_tracer(source.settings, threads=threads, build_quality=2)
-    tracer.build(source.gaussians)
+    tracer.build(source.gaussians, shading.features(source.gaussians))
     paint = scene_render_fn(
         tracer,
         background,
         transparent=transparent,
         trained_rad=source.trained_rad,
-        shading=learnt or PLAIN_SHADING,
+        shading=shading,
+        gives_radiance=materials is not None,
     )
     return output.write(shots, paint, finished, progress)
 

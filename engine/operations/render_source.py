@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float32
@@ -15,6 +16,7 @@ from octasplat.engine.dataset.model import Viewpoints
 from octasplat.engine.dataset.views_file import SplitViewpoints
 from octasplat.engine.files import read_metadata
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
+from octasplat.engine.gaussians.materials import has_materials
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.operations.axes import axis_named
 from octasplat.engine.operations.render_options import PictureRequest
@@ -34,17 +36,20 @@ from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.render.renderer import background_color
 from octasplat.engine.render.shots import Shot, gaussian_turntable, view_shots
 from octasplat.engine.runs.config import read_config
+from octasplat.engine.runs.finished_shading import finished_shading
 from octasplat.engine.runs.run_folder import (
     CONFIG,
     SCENE,
     is_run,
-    run_background,
     run_min_view_distance,
     run_viewpoints,
 )
 from octasplat.engine.shading.background import LearnedBackground
+from octasplat.engine.shading.deferred import DeferredShading
 from octasplat.engine.trace.protocol import TraceSettings
+from octasplat.engine.train.shading_factory import ShadingOptions, find_background, find_deferred
 
+_NO_LIGHT = "a file does not hold the light that its materials were learnt in."
 ANY_SIDE_PX = 1 << 30
 """A cap that no photograph reaches."""
 
@@ -62,6 +67,7 @@ class RenderSource:
         max_side: longer side of the photographs in the training, px.
         trained_rad: angle of a pixel of the training.
         learnt: background that the run has learnt.
+        materials: shading of the run's materials in the light that it has learnt.
         photographs: where the photographs were taken from, at their full size, if that was asked for.
         origin_world: where the scene has its origin in the coordinates of its user, see
             :mod:`octasplat.engine.core.local_origin`.
@@ -75,6 +81,7 @@ class RenderSource:
     max_side: int | None = None
     trained_rad: float = 0.0
     learnt: LearnedBackground | None = None
+    materials: DeferredShading | None = None
     photographs: Viewpoints | None = None
     origin_world: Origin = NO_ORIGIN
 
@@ -93,6 +100,7 @@ def read_render_source(
     dataset: Path | None = None,
     max_side: int | None = None,
     full_size: bool = False,
+    shading: Literal["materials", "harmonics"] | None = "harmonics",
 ) -> RenderSource:
     """Read a scene to render.
 
@@ -102,9 +110,11 @@ def read_render_source(
         dataset: folder of photographs whose cameras to take, instead of those that the run keeps.
         max_side: cap on the longer side of the views, px; None takes the run's.
         full_size: whether to read the cameras at the full size of the photographs, too, as stages need them.
+        shading: whether to read the materials' light; None does where the run has learnt it.
 
     Raises:
-        ConfigError: cameras of photographs are asked for, of which a file knows nothing.
+        ConfigError: cameras of photographs, or materials, are asked for, of which a file, or the run, knows
+            nothing.
         OctasplatError: it cannot be read.
     """
     if not is_run(source):
@@ -114,6 +124,15 @@ def read_render_source(
                 "folder out, or name the cameras in another way."
             )
         gaussians, facts = open_scene(source, progress), read_metadata(source)
+        if shading == "materials":
+            raise ConfigError(f"{source}: {_NO_LIGHT} octasplat relight shows materials in a given light.")
+        if shading is None and has_materials(gaussians):
+            progress(
+                Noted(
+                    f"{source}: {_NO_LIGHT} Its harmonics are shown; octasplat relight shows its materials "
+                    "in a given light."
+                )
+            )
         settings = TraceSettings(flip_normal_cos=facts.turned_beyond)
         return RenderSource(
             gaussians,
@@ -129,17 +148,24 @@ def read_render_source(
         )
     viewpoints = run_viewpoints(source, scene=dataset, max_side=max_side)
     photographs = run_viewpoints(source, scene=dataset, max_side=ANY_SIDE_PX) if full_size else None
-    learnt = run_background(source)
+    gaussians = read_gaussian_ply(source / SCENE)[0]
+    options = ShadingOptions.from_config(config.train)
+    if shading == "materials" and (options.materials is None or not has_materials(gaussians)):
+        raise ConfigError(f"{source} has learnt no materials; leave out `shading`.")
+    if shading == "harmonics" or not has_materials(gaussians):  # edits may have left them out
+        options = replace(options, materials=None)
+    learnt = finished_shading(source, options, viewpoints.extent)
     facts = read_metadata(source)
     return RenderSource(
-        gaussians=read_gaussian_ply(source / SCENE)[0],
+        gaussians=gaussians,
         settings=config.train.trace,
         near_world=run_min_view_distance(source, viewpoints),
         background=config.evaluation_background,
         viewpoints=viewpoints,
         max_side=config.max_side,
         trained_rad=facts.pixel_rad,
-        learnt=learnt,
+        learnt=find_background(learnt),
+        materials=find_deferred(learnt),
         photographs=photographs,
         origin_world=facts.origin_world,
     )

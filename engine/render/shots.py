@@ -16,7 +16,12 @@ from octasplat.engine.render.framing import fitting_distance, visible_bounds
 from octasplat.engine.render.image_files import exr_layers, write_exr, write_png
 from octasplat.engine.render.pinhole_camera import PinholeCamera, focal_from_fov
 from octasplat.engine.render.pose_paths import Turntable, fit_turntable
-from octasplat.engine.render.supersampling import rays_per_pixel_side, render_averaged
+from octasplat.engine.render.supersampling import (
+    RADIANCE_RAYS_PER_SIDE,
+    rays_per_pixel_side,
+    render_averaged,
+    render_filtered,
+)
 from octasplat.engine.shading.plain import PLAIN_SHADING
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.protocol import Tracer
@@ -138,6 +143,7 @@ def scene_render_fn(
     transparent: bool = False,
     trained_rad: float = 0.0,
     shading: ShadingModel = PLAIN_SHADING,
+    gives_radiance: bool = False,
 ) -> RenderFn:
     """Return the function that renders a shot of a scene to a file.
 
@@ -151,12 +157,17 @@ def scene_render_fn(
             should be black.
         trained_rad: angle of a pixel of the training views; larger pixels get several rays, so that what is
             smaller than they neither sparkles nor breaks up. 0 where it is not known: one ray each.
-        shading: what develops the rays: a learnt background, say.
+        shading: what develops the rays: a learnt background, or materials in their light.
+        gives_radiance: whether ``shading`` has the layer ``linear``, whose means over a pixel are shown.
     """
 
     def paint(shot: Shot, path: Path, _part: Callable[[float], None]) -> None:
         rays = shot.rays()
-        image = render_averaged(tracer, rays, background, shading, rays_per_pixel_side(rays, trained_rad))
+        side = rays_per_pixel_side(rays, trained_rad)
+        if gives_radiance:
+            image = render_filtered(tracer, rays, background, shading, max(side, RADIANCE_RAYS_PER_SIDE))
+        else:
+            image = render_averaged(tracer, rays, background, shading, side)
         if path.suffix.lower() == ".exr":
             layers = exr_layers(
                 image.rgb_srgb,

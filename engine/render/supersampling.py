@@ -23,6 +23,8 @@ MAX_RAYS_PER_SIDE = 4
 """More rays than 16 a pixel are not worth their time."""
 UNEVEN_RATIO = 0.1
 """Display values of a pixel's rays that are further apart than this are asked for more of them."""
+RADIANCE_RAYS_PER_SIDE = 2
+"""Rays across a pixel, and as many down, of pictures whose shading gives radiance."""
 LINEAR = "linear"
 """The layer of a shading model that holds radiance."""
 

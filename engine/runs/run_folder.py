@@ -14,9 +14,7 @@ from octasplat.engine.dataset.camera_clearance import CameraClearance
 from octasplat.engine.dataset.scene_split import SplitRule
 from octasplat.engine.dataset.views_file import SplitViewpoints, ViewsRecord, read_views, scene_viewpoints
 from octasplat.engine.files import read_metadata
-from octasplat.engine.render.environment_files import read_background_map
 from octasplat.engine.runs.config import ReconstructionConfig, read_config
-from octasplat.engine.shading.background import LearnedBackground
 from octasplat.engine.shading.exposure import ExposuresByName
 
 CONFIG, EVENTS, HELD_OUT, SCENE, TRAINING, VIEWS = (
@@ -162,17 +160,6 @@ def run_environment(output: Path) -> Path:
     """Return the file of the light that a run has learnt; runs of old have the HDR only, others none."""
     exact = output / ENVIRONMENT_EXR
     return exact if exact.exists() else output / ENVIRONMENT_HDR
-
-
-def run_background(output: Path) -> LearnedBackground | None:
-    """Return the learnt background of a finished run; None if it has none.
-
-    Raises:
-        ConfigError: ``output`` is no run, or the background is missing or damaged.
-    """
-    if read_config(output / CONFIG).train.background != "learnt":
-        return None
-    return LearnedBackground.from_map(read_background_map(output / BACKGROUND))
 
 
 def unexported_parts(output: Path) -> str | None:

@@ -71,3 +71,32 @@ def test_materials_run_resumes_to_same_bytes(
     assert result.exit_code == 0, result.output
     for name in ("scene.ply", "environment.hdr", "environment.exr"):
         assert (output / name).read_bytes() == (materials_run / name).read_bytes(), name
+
+
+def test_render_of_materials_run_is_shaded_as_its_evaluation(materials_run, octasplat, tmp_path):
+    result = octasplat("render", materials_run, "-o", tmp_path / "shaded")
+    assert result.exit_code == 0, result.output
+    rendered = sorted((tmp_path / "shaded").glob("*.png"))
+    assert rendered, "the run holds out views"
+    for path in rendered:
+        assert path.read_bytes() == (materials_run / "renders" / path.name).read_bytes()
+    result = octasplat("render", materials_run, "--shading", "harmonics", "-o", tmp_path / "plain")
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / "plain" / rendered[0].name).read_bytes() != rendered[0].read_bytes()
+
+
+def test_render_says_where_materials_cannot_be_shown(materials_run, octasplat, tmp_path):
+    camera = ("--turntable", "--frames", "1", "--width", "32", "--height", "24")
+    scene = materials_run / "scene.ply"
+    result = octasplat("render", scene, *camera, "-o", tmp_path / "file.png")
+    assert result.exit_code == 0 and "octasplat relight shows its materials" in " ".join(
+        result.output.split()
+    )
+    result = octasplat("render", scene, *camera, "--shading", "materials", "-o", tmp_path / "none.png")
+    assert result.exit_code == 1 and "does not hold the light" in " ".join(result.output.split())
+    assert not (tmp_path / "none.png").exists()
+
+
+def test_render_of_plain_run_refuses_materials(run, octasplat, tmp_path):
+    result = octasplat("render", run.output, "--shading", "materials", "-o", tmp_path / "views")
+    assert result.exit_code == 1 and "has learnt no materials" in " ".join(result.output.split())

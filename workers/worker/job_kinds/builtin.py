@@ -165,7 +165,7 @@ def register_builtin_kinds() -> None:
         RenderKind(
             RENDER,
             title="New views of the scene of a reconstruction, as a video or images",
-            source_files=(*RUN_FILES[:4], BACKGROUND_FILE),
+            source_files=(*RUN_FILES[:4], LIGHT_FILE, EXACT_LIGHT_FILE, BACKGROUND_FILE),
         )
     )
     register(

@@ -1,0 +1,42 @@
+"""Shading model of a finished run, with the light, background and exposures that it learnt."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from octasplat.engine.render.environment_files import read_background_map, read_environment
+from octasplat.engine.runs.run_folder import BACKGROUND, run_environment, run_exposures
+from octasplat.engine.shading.protocol import ShadingModel
+from octasplat.engine.train.shading_factory import (
+    ShadingOptions,
+    find_background,
+    find_deferred,
+    find_exposures,
+    make_shading,
+)
+
+
+def finished_shading(
+    output: Path, options: ShadingOptions, extent_world: float, view_names: Sequence[str] = ()
+) -> ShadingModel:
+    """Return the shading model of a finished run with its environment, background and exposures.
+
+    Args:
+        output: folder of the run.
+        options: what it learnt; of exposures, what its record says.
+        extent_world: of the scene.
+        view_names: the photographs of the run, by whose exposures its views are shown; without any the
+            model has no exposures.
+
+    Raises:
+        ConfigError: the run learnt one of these and its file is missing or damaged.
+    """
+    known = run_exposures(output) if view_names else None
+    shading = make_shading(replace(options, learns_exposure=known is not None), len(view_names), extent_world)
+    if (deferred := find_deferred(shading)) is not None:
+        deferred.light.set_radiance(read_environment(run_environment(output)))
+    if (background := find_background(shading)) is not None:
+        background.set_map(read_background_map(output / BACKGROUND))
+    if known is not None and (exposures := find_exposures(shading)) is not None:
+        exposures.load_known(view_names, known)
+    return shading
