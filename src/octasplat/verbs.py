@@ -61,6 +61,7 @@ class RenderArguments(TypedDict, total=False):
     frames_folder: PathLike | None
     background: Literal["black", "white", "transparent"] | None
     stage: BaseModel | Mapping[str, Any] | str | None
+    shading: Literal["materials", "harmonics"] | None
     preview: bool
     layers: bool
     denoise: bool
@@ -658,6 +659,7 @@ def render(
     frames_folder: PathLike | None = None,
     background: Literal["black", "white", "transparent"] | None = None,
     stage: BaseModel | Mapping[str, Any] | str | None = None,
+    shading: Literal["materials", "harmonics"] | None = None,
     preview: bool = False,
     layers: bool = False,
     denoise: bool = False,
@@ -710,6 +712,9 @@ def render(
         stage: Meshes, lights and materials that the scene is rendered with, as docs/light.md describes:
             an object, or the text of a stage file. The files that it names are those of the job's
             files_id.
+        shading: Colors of the Gaussians: their materials in the light that the run has learnt, or their
+            harmonics, which are faster and show no sharp reflections. [default: materials, of a run
+            that has them]
         preview: Stage: render the first image only, to one file, finer and finer.
         layers: Stage: write EXR files with background, shadow and things, for a compositor.
         denoise: Stage: remove the noise of the light from the images; needs the extra denoise.
@@ -761,6 +766,7 @@ def render(
             "frames_folder": frames_folder,
             "background": background,
             "stage": stage,
+            "shading": shading,
             "preview": preview,
             "layers": layers,
             "denoise": denoise,
