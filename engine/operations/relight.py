@@ -169,7 +169,9 @@ def run(
     for sentence in request.unused():
         report(Warned(sentence))
     of_run = is_run(request.source)
-    environments = read_environments(request.environments, request.clamp)
+    environments = read_environments(
+        request.environments, request.clamp, lambda sentence: report(Warned(sentence))
+    )
     source = read_render_source(request.source, report, dataset=request.dataset, max_side=request.max_side)
     require_materials(source.gaussians, request.source / SCENE if of_run else request.source)
     learnt = read_config(request.source / CONFIG).train.materials if of_run else None

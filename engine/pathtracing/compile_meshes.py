@@ -35,6 +35,7 @@ from octasplat.engine.pathtracing.mesh_shapes import (
     read_shape,
     transform_normals,
     transform_points,
+    turn_outwards,
     up_axis_rotation,
 )
 from octasplat.engine.pathtracing.stage.materials import Diffuse, Emissive, Glass
@@ -101,7 +102,8 @@ def compile_meshes(
         stage: whose meshes have no place in the scene left to be found (``on``).
         folder: where the stage's files are relative to.
         threads: for building and tracing; 0 takes all.
-        warn: called with a sentence on what of a mesh file's materials is not understood.
+        warn: called with a sentence on what of a mesh file's materials is not understood, and on what of a
+            file is mended.
         origin_world: local origin of the scene, about which meshes of files in large coordinates are put.
 
     Raises:
@@ -126,7 +128,7 @@ def compile_meshes(
             gathered.add(corners, corner_normals(corners, 0.0), np.full(len(corners), row, np.int32))
     environment = None
     if stage.environment is not None:
-        radiance = read_environment(folder / stage.environment.file)
+        radiance = read_environment(folder / stage.environment.file, warn)
         environment = EnvironmentMap(
             radiance * np.float32(stage.environment.strength),
             environment_frame(up, stage.environment.rotation_degrees),
@@ -208,6 +210,12 @@ def _add_mesh(
     up: Float64[np.ndarray, "3"],
     warn: WarnCallback,
 ) -> None:
+    name = f"meshes[{number}]"
+    materials = _face_materials(mesh, name, shape, warn)
+    for chosen, given in materials:
+        if isinstance(given.material, Glass) and (turned := turn_outwards(shape, chosen)) is not None:
+            warn(f"{name}: {mesh.file} faces inwards; it is turned inside out, as glass needs an outside.")
+            shape = turned
     turn = up_axis_rotation(mesh_up_axis(mesh), mesh.turn_degrees, up)
     corners = transform_points(shape.vertices, mesh, turn)[shape.faces].astype(np.float32)
     degrees = SMOOTH_DEGREES if mesh.smooth_degrees is None else mesh.smooth_degrees
@@ -217,8 +225,7 @@ def _add_mesh(
         known = np.isfinite(stated).all(axis=(1, 2))
         normals[known] = stated[known]
     rows = np.empty(len(corners), np.int32)
-    name = f"meshes[{number}]"
-    for chosen, given in _face_materials(mesh, name, shape, warn):
+    for chosen, given in materials:
         has_uv = shape.corner_uv is not None and bool(np.isfinite(shape.corner_uv[chosen]).all())
         tinted = mesh.material is None and shape.corner_rgb_linear is not None
         row = builder.table.add(

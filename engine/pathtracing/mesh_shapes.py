@@ -1,6 +1,6 @@
 """Meshes of a stage: primitives, files, placement, and smooth normals."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -160,6 +160,46 @@ def count_open_edges(shape: MeshShape, face_mask: Bool[np.ndarray, " f"] | None 
     sound = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     report = edge_report(faces[sound])
     return report.open_edges + report.non_manifold_edges + report.inconsistent_edges
+
+
+def turn_outwards(shape: MeshShape, face_mask: Bool[np.ndarray, " f"]) -> MeshShape | None:
+    """Return a shape with some closed faces turned inside out; None where they face outwards already.
+
+    Args:
+        shape: the triangles.
+        face_mask: the faces, which close one or more solids; what they enclose has a negative volume where
+            they face inwards.
+    """
+    faces = shape.faces[face_mask]
+    points = shape.vertices - shape.vertices.mean(axis=0)
+    a, b, c = points[faces[:, 0]], points[faces[:, 1]], points[faces[:, 2]]
+    if np.einsum("fk,fk->", a, np.cross(b, c)) >= 0:
+        return None
+
+    def turned(corners: np.ndarray | None) -> np.ndarray | None:
+        if corners is None:
+            return None
+        found = corners.copy()
+        found[face_mask] = corners[face_mask][:, [0, 2, 1]]
+        return found
+
+    normals = shape.normals
+    if normals is not None:
+        outwards = np.cross(c - a, b - a)
+        agreement = np.nansum(normals[faces] * outwards[:, None], axis=(1, 2)).sum()
+        if agreement < 0:
+            normals = normals.copy()
+            own = np.unique(faces)
+            normals[own] = -normals[own]
+    turned_faces = turned(shape.faces)
+    assert turned_faces is not None
+    return replace(
+        shape,
+        faces=turned_faces,
+        corner_uv=turned(shape.corner_uv),
+        normals=normals,
+        corner_rgb_linear=turned(shape.corner_rgb_linear),
+    )
 
 
 def _sphere_shape() -> MeshShape:

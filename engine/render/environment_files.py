@@ -3,6 +3,7 @@
 A learnt background, whose values are display values, is such a file too, so that other programs can use it.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +16,17 @@ from octasplat.engine.render.image_files import read_image, write_exr, write_rgb
 MAX_PIXELS = 1 << 27
 
 
-def read_environment(path: Path) -> Float32[np.ndarray, "h w 3"]:
+def read_environment(path: Path, warn: Callable[[str], None] | None = None) -> Float32[np.ndarray, "h w 3"]:
     """Return the linear radiance of an HDR or EXR image; a single channel stands for all three.
 
+    Args:
+        path: the image.
+        warn: called with a sentence where values that no light has are replaced, and where the image is
+            black or has not the shape of such a map. None refuses such values and says nothing of the rest.
+
     Raises:
-        ConfigError: the file is no such image, or holds values that are negative or not finite.
+        ConfigError: the file is no such image, or holds values that are negative or not finite and nobody
+            is told.
     """
     if path.suffix.lower() not in (".hdr", ".exr", ".pic"):
         raise ConfigError(f"{path}: an environment is an HDR or EXR image; an 8-bit one holds no light.")
@@ -30,8 +37,27 @@ def read_environment(path: Path) -> Float32[np.ndarray, "h w 3"]:
     if image.shape[0] * image.shape[1] > MAX_PIXELS:
         raise ConfigError(f"{path}: has more than {MAX_PIXELS >> 20} million pixels; make it smaller.")
     rgb = image[..., :3] if image.shape[2] >= 3 else np.repeat(image[..., :1], 3, axis=2)
-    if not np.isfinite(rgb).all() or (rgb < 0).any():
-        raise ConfigError(f"{path}: holds values that are negative or not finite; mend the image.")
+    invalid = ~(np.isfinite(rgb) & (rgb >= 0)).all(axis=2)
+    if invalid.any():
+        if warn is None:
+            raise ConfigError(f"{path}: holds values that are negative or not finite; mend the image.")
+        if invalid.all():
+            raise ConfigError(f"{path}: all of its pixels are negative or not finite; choose another image.")
+        warn(
+            f"{path}: {invalid.sum():,} of {invalid.size:,} pixels hold values that are negative or not "
+            "finite; negative ones count as 0, infinite ones as the brightest pixel, others as 0."
+        )
+        brightest = rgb[np.isfinite(rgb)].max()
+        rgb = np.maximum(np.nan_to_num(rgb, nan=0.0, posinf=brightest, neginf=0.0), 0.0)
+    if warn is not None:
+        height, width = rgb.shape[:2]
+        if width != 2 * height:
+            warn(
+                f"{path}: is {width} x {height} pixels; an equirectangular map is twice as wide as high, so "
+                "this one is stretched around."
+            )
+        if not rgb.any():
+            warn(f"{path}: is black, so that it lights nothing.")
     return np.ascontiguousarray(rgb)
 
 

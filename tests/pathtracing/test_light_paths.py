@@ -7,6 +7,7 @@ import pytest
 
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.pathtracing.compile_meshes import check_outside_glass, compile_meshes
+from octasplat.engine.pathtracing.mesh_shapes import primitive_shape
 from octasplat.engine.pathtracing.path_tracer import PathTracer, PathTracerScene
 from octasplat.engine.pathtracing.stage.materials import Dielectric, Diffuse, Glass, Metal, Mirror
 from octasplat.engine.pathtracing.stage.model import (
@@ -206,6 +207,23 @@ def test_open_glass_and_camera_inside_glass_are_refused(tmp_path: Path) -> None:
     (tmp_path / "leaf.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     with pytest.raises(ConfigError, match=r"leaf\.obj is not closed"):
         compile_meshes(Stage(meshes=(StageMesh(file="leaf.obj", material=Glass()),)), tmp_path)
+
+
+def test_glass_that_faces_inwards_is_turned_and_told(tmp_path: Path) -> None:
+    ball = primitive_shape("sphere")
+    for name, faces in (("right.obj", ball.faces), ("inside_out.obj", ball.faces[:, ::-1])):
+        lines = [f"v {x} {y} {z}" for x, y, z in ball.vertices]
+        lines += [f"f {a} {b} {c}" for a, b, c in faces + 1]
+        (tmp_path / name).write_text("\n".join(lines))
+    seen, told = [], []
+    for name in ("right.obj", "inside_out.obj"):
+        stage = Stage(
+            gaussians=(), meshes=(StageMesh(file=name, material=Glass(absorption=(0.5, 0.1, 0.0))),)
+        )
+        compiled = compile_meshes(stage, tmp_path, warn=told.append)
+        seen.append(np.sort(compiled.surfaces.corner_normals.reshape(-1, 3), axis=0))
+    np.testing.assert_allclose(seen[1], seen[0], atol=1e-5)
+    assert len(told) == 1 and "inside_out.obj faces inwards" in told[0]
 
 
 def test_neither_threads_nor_samples_added_later_change_a_picture_of_meshes() -> None:

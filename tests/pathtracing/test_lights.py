@@ -156,6 +156,24 @@ def test_environment_invalid_image_is_refused(tmp_path: Path) -> None:
         read_environment(tmp_path / "bad.exr")
 
 
+def test_environment_odd_pixels_are_replaced_and_told(tmp_path: Path) -> None:
+    values = np.full((4, 8), 2.0, np.float32)
+    values[0, :4] = np.nan, -1.0, np.inf, -np.inf
+    write_exr(tmp_path / "odd.exr", {"R": values, "G": values, "B": values}, half=False)
+    told: list[str] = []
+    radiance = read_environment(tmp_path / "odd.exr", told.append)
+    np.testing.assert_array_equal(radiance[0, :4, 0], [0.0, 0.0, 2.0, 0.0])
+    assert (radiance[1:] == 2.0).all() and len(told) == 1 and "4 of 32 pixels" in told[0]
+    for name, shape, sentence in (
+        ("square", (8, 8), "twice as wide as high"), ("black", (4, 8), "is black"),
+    ):  # fmt: skip
+        told.clear()
+        light = np.full(shape, 0.0 if name == "black" else 1.0, np.float32)
+        write_exr(tmp_path / f"{name}.exr", {"R": light, "G": light, "B": light})
+        read_environment(tmp_path / f"{name}.exr", told.append)
+        assert len(told) == 1 and sentence in told[0]
+
+
 def test_environment_file_round_trips(tmp_path: Path) -> None:
     radiance = np.random.default_rng(0).lognormal(0, 2, (16, 32, 3)).astype(np.float32)
     write_environment(tmp_path / "map.exr", radiance)

@@ -32,12 +32,15 @@ class ShotLighting:
     rotation_degrees: float
 
 
-def read_environments(paths: Sequence[Path], clamp: float | None) -> dict[str, RadianceMap]:
+def read_environments(
+    paths: Sequence[Path], clamp: float | None, warn: Callable[[str], None]
+) -> dict[str, RadianceMap]:
     """Read environment maps.
 
     Args:
         paths: of HDR or EXR images.
         clamp: radiance at which they are cut off; None for no limit.
+        warn: called with a sentence on what of an image is odd, or replaced.
 
     Returns:
         The maps by the names of their files, without suffixes.
@@ -49,7 +52,9 @@ def read_environments(paths: Sequence[Path], clamp: float | None) -> dict[str, R
     for path in paths:
         if path.stem in found:
             raise ConfigError(f"{path}: two environments are called {path.stem}; rename one.")
-        found[path.stem] = np.minimum(read_environment(path), np.float32(np.inf if clamp is None else clamp))
+        found[path.stem] = np.minimum(
+            read_environment(path, warn), np.float32(np.inf if clamp is None else clamp)
+        )
     return found
 
 
