@@ -78,15 +78,6 @@ class LearnedBackground(WrapperModel):
         self._smoothness_weight = smoothness_weight
         super().__init__(inner)
 
-    @classmethod
-    def from_map(
-        cls, rgb_srgb: Float32[np.ndarray, "h w 3"], inner: ShadingModel = PLAIN_SHADING
-    ) -> "LearnedBackground":
-        """Return a model with a finished map behind another model."""
-        background = cls(len(rgb_srgb), inner=inner)
-        background.set_map(rgb_srgb)
-        return background
-
     def set_map(self, rgb_srgb: Float32[np.ndarray, "h w 3"]) -> None:
         """Take another map of this size instead."""
         assert rgb_srgb.shape == self.rgb_srgb.shape, "a map of another size"
