@@ -1,6 +1,6 @@
 """Live workers of a queue: which can run a job, and the notes for its owner."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 from pydantic import BaseModel
@@ -70,6 +70,18 @@ def queued_job_notes(
     if needy:
         notes.append(f"Whether {' and '.join(needy)} can be written is not known before a worker is there.")
     return notes
+
+
+def paused_queue_note(queue: str) -> str:
+    """Return that an administrator has paused a queue."""
+    return f"An administrator has paused the queue {queue}; the job waits until it goes on."
+
+
+def drained_workers_note(workers: Sequence[WorkerRow], drained: Collection[str], queue: str) -> list[str]:
+    """Return that all workers of a queue are drained, if they are."""
+    if not workers or any(row.name not in drained for row in workers):
+        return []
+    return [f"All workers of the queue {queue} are being drained; the job waits for another one."]
 
 
 def busy_workers_note(workers: Sequence[WorkerRow], running: Mapping[str, int], queue: str) -> list[str]:

@@ -29,14 +29,18 @@ class ViewFrusta:
 
     def contains(self, xyz_world: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Return whether each point lies in any of the frusta."""
-        inside = np.zeros(len(xyz_world), np.bool_)
+        return self.contains_often(xyz_world, 1)
+
+    def contains_often(self, xyz_world: Float[np.ndarray, "n 3"], count: int) -> Bool[np.ndarray, " n"]:
+        """Return whether each point lies in at least ``count`` of the frusta."""
+        found = np.zeros(len(xyz_world), np.int64)
         for view in self.views:
-            left = np.flatnonzero(~inside)
+            left = np.flatnonzero(found < count)
             if len(left) == 0:
                 break
             in_cam = cam_from_world(xyz_world[left].astype(np.float64), view)
-            inside[left] = is_in_image(in_cam, self.cameras[view.camera_index])
-        return inside
+            found[left] += is_in_image(in_cam, self.cameras[view.camera_index])
+        return np.asarray(found >= count)
 
 
 def cam_from_world(xyz_world: Float64[np.ndarray, "n 3"], view: PosedView) -> Float64[np.ndarray, "n 3"]:

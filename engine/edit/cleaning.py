@@ -1,7 +1,9 @@
 """Removal of Gaussians that disturb: faint, oversized, too near to a camera, or floaters."""
 
+from collections.abc import Callable
+
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float32
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
@@ -17,11 +19,15 @@ Gaussian does not hold everything together."""
 
 
 def clean(
-    gaussians: FlatGaussians, options: CleanupOptions, near_zones: CameraClearance | None = None
+    gaussians: FlatGaussians,
+    options: CleanupOptions,
+    near_zones: CameraClearance | None = None,
+    seen: Callable[[Float32[np.ndarray, "n 3"]], Bool[np.ndarray, " n"]] | None = None,
 ) -> tuple[Bool[np.ndarray, " n"], CleanReport]:
     """Return a mask of the Gaussians to keep, and counts of the others by reason.
 
-    Floaters are looked for among those that pass the thresholds and lie outside of ``near_zones``.
+    Floaters are looked for among those that pass the thresholds, lie outside of ``near_zones`` and for whose
+    centres ``seen`` is true.
     """
     largest = gaussians.scales.max(axis=1, initial=0.0)
     faint = gaussians.opacities < options.min_opacity
@@ -32,6 +38,8 @@ def clean(
     if near_zones is not None:
         near = keep & near_zones.contains(gaussians.means_world)
         keep &= ~near
+    unseen = keep & ~seen(gaussians.means_world) if seen is not None else np.zeros(len(gaussians), np.bool_)
+    keep &= ~unseen
     floating, groups = 0, 0
     if options.floaters and keep.any():
         rows = np.flatnonzero(keep)
@@ -45,6 +53,7 @@ def clean(
         small=int(small.sum()),
         large=int(large.sum()),
         near=int(near.sum()),
+        unseen=int(unseen.sum()),
         floating=floating,
         groups=groups,
         kept=int(keep.sum()),

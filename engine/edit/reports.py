@@ -99,6 +99,7 @@ class CleanReport(BaseModel):
         small: below the least scale.
         large: above the largest scale.
         near: nearer to a camera than what its photograph shows.
+        unseen: in the images of too few training views.
         floating: in groups too small.
         groups: number of such groups.
         kept: those that stay.
@@ -110,6 +111,7 @@ class CleanReport(BaseModel):
     small: int
     large: int
     near: int
+    unseen: int
     floating: int
     groups: int
     kept: int

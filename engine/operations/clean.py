@@ -21,11 +21,11 @@ from octasplat.engine.operations.base import (
     stop_if,
 )
 from octasplat.engine.settings import renamed_settings
-from octasplat.engine.settings.fields import OUTPUT_FLAGS, Spelling
+from octasplat.engine.settings.fields import OUTPUT_FLAGS, Spelling, Unit
 
 
 class CleanOptions(CleanupOptions, Options):
-    """Options of which Gaussians to remove: faint, too small or large, isolated, or close to a camera."""
+    """Options of which Gaussians to remove: faint, too small or large, isolated, unseen or near a camera."""
 
     former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.CLEAN
 
@@ -36,10 +36,16 @@ class CleanOptions(CleanupOptions, Options):
         description="In a run: remove those nearer to the camera of a training view than this share of the "
         "distance at which the sparse points around it begin; 0 for none.",
     )
+    min_views: Annotated[int, Unit("views")] = Field(
+        0,
+        ge=0,
+        description="In a run: remove those whose centre lies in the image of fewer training views than "
+        "this, which lie beyond what the cameras see; 0 for none.",
+    )
 
 
 class CleanRequest(CleanOptions, SourceRequest):
-    """Remove Gaussians of the scene that cannot be seen, are too large, too near to a camera, or float.
+    """Remove Gaussians that cannot be seen, are too large, near to a camera or out of all views, or float.
 
     ``octasplat info`` tells how large and how opaque they are.
     """
@@ -79,7 +85,7 @@ def run(
     """
     from octasplat.engine.edit.cleaning import clean
     from octasplat.engine.operations import scene_io
-    from octasplat.engine.runs.run_folder import is_run, run_camera_clearance
+    from octasplat.engine.runs.run_folder import is_run, run_camera_clearance, run_seen_test
 
     source: Path = request.source
     if request.output is not None:
@@ -87,10 +93,12 @@ def run(
     gaussians = scene_io.open_scene(source, progress)
     share = request.camera_clearance
     zones = run_camera_clearance(source, share) if share > 0 and is_run(source) else None
-    keep, report = clean(gaussians, request, zones)
+    seen = run_seen_test(source, request.min_views) if request.min_views > 0 and is_run(source) else None
+    keep, report = clean(gaussians, request, zones, seen)
     message = (
         f"{source}: {len(gaussians):,} Gaussians; {report.faint:,} too faint, {report.small:,} too small, "
         f"{report.large:,} too large, {report.near:,} too near to a camera, "
+        f"{report.unseen:,} beyond what the cameras see, "
         f"{report.floating:,} in {report.groups:,} groups of floaters; {report.kept:,} kept."
     )
     if not keep.any():

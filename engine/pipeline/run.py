@@ -10,12 +10,13 @@ from octasplat.engine.core.errors import CancelledError, ExportError
 from octasplat.engine.core.events import EventListener
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.dataset.views_file import ViewsRecord
+from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.protocol import Tracer
 
-OnStep = Callable[[int, Dataset, Tracer, ShadingModel], None]
-"""Called between two iterations of a training: iterations done, photographs, tracer and shading."""
+OnStep = Callable[[int, Dataset, Tracer, ShadingModel, FlatGaussians], None]
+"""Called between two iterations of a training: iterations done, photographs, tracer, shading, Gaussians."""
 
 
 @dataclass

@@ -131,7 +131,7 @@ def _make_trainer(
         view_frusta=frusta if _prunes_unseen(config.materials) else None,
         on_step=None
         if (on_step := run.on_step) is None
-        else lambda done, tracer: on_step(done, dataset, tracer, trainer.shading),
+        else lambda done, tracer: on_step(done, dataset, tracer, trainer.shading, trainer.state.gaussians),
     )
     return trainer
 

@@ -2,9 +2,11 @@
 
 import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from octasplat.engine.core.errors import ConfigError, DatasetError
 from octasplat.engine.core.events import EventListener, PhaseProgress, Warned
@@ -12,6 +14,7 @@ from octasplat.engine.core.local_origin import Origin
 from octasplat.engine.dataset import Dataset, load_dataset_model
 from octasplat.engine.dataset.camera_clearance import CameraClearance
 from octasplat.engine.dataset.scene_split import SplitRule
+from octasplat.engine.dataset.view_frusta import ViewFrusta
 from octasplat.engine.dataset.views_file import SplitViewpoints, ViewsRecord, read_views, scene_viewpoints
 from octasplat.engine.files import read_metadata
 from octasplat.engine.runs.config import ReconstructionConfig, read_config
@@ -145,6 +148,21 @@ def run_camera_clearance(output: Path, share: float) -> CameraClearance | None:
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ConfigError):
         return None
     return CameraClearance.from_views(scene, radii, scene.train_indices)
+
+
+def run_seen_test(
+    output: Path, min_views: int
+) -> Callable[[Float[np.ndarray, "n 3"]], Bool[np.ndarray, " n"]] | None:
+    """Return the test of which points lie in the images of at least so many training views of a run.
+
+    None where the run keeps no cameras. A run of fewer views than ``min_views`` is asked for all of them.
+    """
+    try:
+        scene = read_views(output / VIEWS).viewpoints(None)
+    except (OSError, ConfigError):
+        return None
+    frusta = ViewFrusta.from_views(scene, scene.train_indices)
+    return partial(frusta.contains_often, count=min(min_views, len(frusta.views)))
 
 
 def run_exposures(output: Path) -> ExposuresByName | None:

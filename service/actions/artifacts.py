@@ -7,6 +7,8 @@ from octasplat.service.auth import Principal
 from octasplat.service.problems import not_found_error
 from octasplat.service.state import Service
 from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
+from octasplat.workers.db.live_scenes import LiveScene
+from octasplat.workers.db.live_scenes import get_live_scene as read_live_scene
 from octasplat.workers.db.rows import Artifact, Job
 from octasplat.workers.queue import jobs as rows
 from octasplat.workers.storage.protocol import Blob
@@ -68,3 +70,27 @@ async def get_preview(service: Service, principal: Principal, job_id: uuid.UUID)
     if job.preview is None:
         raise not_found_error("picture yet")
     return await run_in_pool(ThreadPurpose.DOWNLOADS, service.storage.stat, job.preview["sha256"])
+
+
+async def find_live_scene(service: Service, principal: Principal, job_id: uuid.UUID) -> LiveScene | None:
+    """Return the newest state of a job's training; None if there is none.
+
+    Raises:
+        ProblemError: 404 if the job does not exist or the principal may not see it.
+    """
+    async with service.pool.connection() as connection:
+        await fetch_visible_job(connection, principal, job_id)
+        return await read_live_scene(connection, job_id)
+
+
+async def get_live_scene(service: Service, principal: Principal, job_id: uuid.UUID) -> Blob:
+    """Return the newest state of a job's training, a PLY file.
+
+    Raises:
+        ProblemError: 404 if it does not exist or the principal may not see it.
+        StorageError: the store does not have it.
+    """
+    scene = await find_live_scene(service, principal, job_id)
+    if scene is None:
+        raise not_found_error("state of its training")
+    return await run_in_pool(ThreadPurpose.DOWNLOADS, service.storage.stat, scene.sha256)

@@ -15,10 +15,17 @@ from octasplat.service.auth import Principal
 from octasplat.service.idempotency import create_once, fingerprint
 from octasplat.service.job_limits import limit_notes
 from octasplat.service.problems import ProblemError
-from octasplat.service.queue_workers import busy_workers_note, live_workers_of_queue, queued_job_notes
+from octasplat.service.queue_workers import (
+    busy_workers_note,
+    drained_workers_note,
+    live_workers_of_queue,
+    paused_queue_note,
+    queued_job_notes,
+)
 from octasplat.service.schemas.jobs import JobChange, JobView
 from octasplat.service.state import Service
 from octasplat.workers.db.connections import Connection, retry_on_deadlock
+from octasplat.workers.db.holds import read_holds
 from octasplat.workers.db.rows import Job, JobState
 from octasplat.workers.queue import jobs as rows
 from octasplat.workers.worker.job_kinds import get_job_kind
@@ -102,7 +109,7 @@ async def change_job(
     change: JobChange,
     check: Callable[[JobWithView], None] = lambda _: None,
 ) -> JobWithView:
-    """Rename a job, or pin it so that it does not expire.
+    """Rename a job, pin it so that it does not expire, or replace its notes.
 
     Args:
         service: the service.
@@ -123,6 +130,7 @@ async def change_job(
             job_id,
             label=given.get("label", job.label),
             pinned=bool(given["pinned"]) if given.get("pinned") is not None else job.pinned,
+            view_notes=given.get("view_notes"),
         )
         return JobWithView(job, await job_view(connection, service, principal, job))
 
@@ -204,13 +212,18 @@ async def job_view(connection: Connection, service: Service, principal: Principa
     """
     notes = [job.begun_anew] if job.begun_anew is not None else []
     if job.state == "queued":
-        if job.waits_for is not None:
+        holds = await read_holds(connection)
+        if job.queue in holds.queues:
+            notes.append(paused_queue_note(job.queue))
+        elif job.waits_for is not None:
             notes.append(shorten_absolute_paths(job.waits_for))
         with suppress(ConfigError, ValidationError):  # of another version
             kind = get_job_kind(job.kind)
             workers = await live_workers_of_queue(connection, job.queue, service.settings.stale_seconds)
             notes += queued_job_notes(kind, expected_options(kind, job), job.queue, workers)
             notes += limit_notes(job.estimate, workers, service.settings)
+            if not notes:
+                notes += drained_workers_note(workers, holds.workers, job.queue)
             if not notes:
                 notes += busy_workers_note(workers, await rows.running_by_queue(connection), job.queue)
     return JobView.from_row(

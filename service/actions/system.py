@@ -11,10 +11,14 @@ from octasplat.service.problems import not_found_error
 from octasplat.service.schemas.system import FormatView, InfoView, KindView, QueueList, QueueView, WorkerView
 from octasplat.service.state import Service
 from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
+from octasplat.workers.db.connections import Connection
+from octasplat.workers.db.holds import read_holds
+from octasplat.workers.db.holds import set_queue_paused as write_queue_paused
+from octasplat.workers.db.holds import set_worker_drained as write_worker_drained
 from octasplat.workers.db.migrate import missing_migrations
 from octasplat.workers.db.rows import WorkerRow
 from octasplat.workers.db.workers import live_workers
-from octasplat.workers.queue.jobs import queue_depths, running_by_queue
+from octasplat.workers.queue.jobs import queue_depths, running_by_queue, running_by_worker
 from octasplat.workers.queue.service_stats import read_service_stats
 from octasplat.workers.sandbox.capabilities import sandbox_capabilities
 from octasplat.workers.storage.errors import StorageError
@@ -68,16 +72,50 @@ async def list_queues(service: Service, principal: Principal) -> QueueList:
 
     Workers, which are named after their hosts, are for administrators.
     """
-    owner = principal.visible_owner
     async with service.pool.connection() as connection:
-        depths = {depth.queue: depth for depth in await queue_depths(connection, owner)}
-        running = await running_by_queue(connection, owner)
-        workers = await live_workers(connection, service.settings.stale_seconds)
+        return await _queue_list(connection, service, principal)
+
+
+async def set_queue_paused(service: Service, principal: Principal, queue: str, paused: bool) -> QueueView:
+    """Pause a queue or let it go on; returns it as it is now.
+
+    Also a queue that nothing is in and no worker takes yet, so that it is paused before its first job.
+    """
+    async with service.pool.connection() as connection, connection.transaction():
+        await write_queue_paused(connection, queue, paused)
+        found = await _queue_list(connection, service, principal, also=queue)
+    return next(view for view in found.queues if view.queue == queue)
+
+
+async def set_worker_drained(service: Service, principal: Principal, name: str, drained: bool) -> WorkerView:
+    """Drain a live worker or let it take jobs again; returns it as it is now.
+
+    Raises:
+        ProblemError: 404 if no live worker has that name.
+    """
+    async with service.pool.connection() as connection, connection.transaction():
+        await write_worker_drained(connection, name, drained)
+        found = await _queue_list(connection, service, principal)
+        workers = [view for view in found.workers if view.name == name]
+        if not workers:
+            raise not_found_error("live worker of that name")
+    return workers[0]
+
+
+async def _queue_list(
+    connection: Connection, service: Service, principal: Principal, *, also: str = "cpu"
+) -> QueueList:
+    owner = principal.visible_owner
+    depths = {depth.queue: depth for depth in await queue_depths(connection, owner)}
+    running = await running_by_queue(connection, owner)
+    workers = await live_workers(connection, service.settings.stale_seconds)
+    holds = await read_holds(connection)
+    busy = await running_by_worker(connection)
     slots: dict[str, int] = {}
     for worker in workers:
         for queue in worker.queues:
             slots[queue] = slots.get(queue, 0) + worker.slots
-    names = sorted({"cpu", *depths, *running, *slots})
+    names = sorted({"cpu", also, *depths, *running, *slots, *holds.queues})
     return QueueList(
         queues=[
             QueueView(
@@ -86,11 +124,21 @@ async def list_queues(service: Service, principal: Principal) -> QueueList:
                 oldest_seconds=depths[name].oldest_seconds if name in depths else None,
                 running=running.get(name, 0),
                 slots=slots.get(name, 0),
+                paused=name in holds.queues,
             )
             for name in names
         ],
         workers=[
-            WorkerView.model_validate(worker, from_attributes=True)
+            WorkerView(
+                name=worker.name,
+                queues=worker.queues,
+                slots=worker.slots,
+                facts=worker.facts,
+                running=busy.get(worker.name, 0),
+                drained=worker.name in holds.workers,
+                started_at=worker.started_at,
+                seen_at=worker.seen_at,
+            )
             for worker in workers
             if principal.may("admin")
         ],

@@ -91,3 +91,25 @@ async def get_preview(
     )
     response.headers["Cache-Control"] = "no-cache"
     return response
+
+
+@router.get(
+    "/{job_id}/live-scene",
+    responses={**stored_content("application/octet-stream"), **problem_responses(404, 410, 416)},
+    response_class=Response,
+)
+async def get_live_scene(
+    job_id: JobId, principal: Reader, service: ServiceDep, request: Request,
+    _step: PreviewStep = None, _range: Range = None, _if_none_match: IfNoneMatch = None,
+) -> Response:  # fmt: skip
+    """Return the newest state of a training as a PLY file, decimated; the sparse points before it begins.
+
+    The event `live_scene` tells of each. There is none any more once the job has succeeded.
+    """
+    blob = await actions.get_live_scene(service, principal, job_id)
+    response = await send_blob(
+        service, request, blob.sha256, blob.size_bytes,
+        media_type="application/octet-stream", name="live_scene.ply",
+    )  # fmt: skip
+    response.headers["Cache-Control"] = "no-cache"
+    return response

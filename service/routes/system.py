@@ -6,9 +6,19 @@ from fastapi import APIRouter, Path, Response
 
 from octasplat.service.actions import system as actions
 from octasplat.service.actions.usage import read_usage
-from octasplat.service.auth import Reader
+from octasplat.service.auth import Admin, Reader
 from octasplat.service.routes import problem_responses
-from octasplat.service.schemas.system import Health, InfoView, KindList, KindView, QueueList
+from octasplat.service.schemas.system import (
+    Health,
+    InfoView,
+    KindList,
+    KindView,
+    QueueChange,
+    QueueList,
+    QueueView,
+    WorkerChange,
+    WorkerView,
+)
 from octasplat.service.schemas.usage import UsageView
 from octasplat.service.state import ServiceDep
 
@@ -16,6 +26,11 @@ router = APIRouter(prefix="/v1", tags=["service"])
 health_router = APIRouter(tags=["health"])
 
 KindName = Annotated[str, Path(description="Name of the kind, such as reconstruct.")]
+
+QueueName = Annotated[
+    str, Path(pattern="^[a-z][a-z0-9_-]{0,40}$", description="Name of the queue, such as cpu.")
+]
+WorkerName = Annotated[str, Path(max_length=200, description="Name of a live worker.")]
 
 
 @router.get("/options", responses=problem_responses())
@@ -46,6 +61,28 @@ async def get_usage(principal: Reader, service: ServiceDep) -> UsageView:
 async def list_queues(principal: Reader, service: ServiceDep) -> QueueList:
     """List the queues with your waiting and running jobs; for administrators everybody's, and the workers."""
     return await actions.list_queues(service, principal)
+
+
+@router.patch("/queues/{queue}", responses=problem_responses())
+async def change_queue(
+    queue: QueueName, change: QueueChange, principal: Admin, service: ServiceDep
+) -> QueueView:
+    """Pause a queue, so that it hands out no jobs, or let it go on; jobs that run are left alone.
+
+    It stays so when the service is restarted.
+    """
+    return await actions.set_queue_paused(service, principal, queue, change.paused)
+
+
+@router.patch("/workers/{worker}", responses=problem_responses(404))
+async def change_worker(
+    worker: WorkerName, change: WorkerChange, principal: Admin, service: ServiceDep
+) -> WorkerView:
+    """Drain a worker, so that it finishes what it has and takes nothing new, or let it take jobs again.
+
+    A worker of the same name (`octasplat worker --name`) is still drained when it starts again.
+    """
+    return await actions.set_worker_drained(service, principal, worker, change.drained)
 
 
 @health_router.get("/healthz")

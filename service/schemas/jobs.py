@@ -4,7 +4,7 @@ import uuid
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -64,11 +64,30 @@ class NewJob(RequestBody):
     webhook: JobWebhook | None = Field(None, description="Be told of this job; see POST /v1/webhooks.")
 
 
+Coordinate = Annotated[float, Field(allow_inf_nan=False)]
+MAX_VIEW_NOTES = 100
+
+
+class ViewNote(BaseModel):
+    """What somebody wrote at a place of the 3D view."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    text: str = Field(min_length=1, max_length=500)
+    position: tuple[Coordinate, Coordinate, Coordinate] = Field(description="The place, in scene.ply.")
+    camera: tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate] = Field(
+        description="Where the camera was, and what it looked at."
+    )
+
+
 class JobChange(RequestBody):
     """Changes of a job."""
 
     label: str | None = Field(None, max_length=200)
     pinned: bool | None = Field(None, description="Keep it whatever its age.")
+    view_notes: list[ViewNote] | None = Field(
+        None, max_length=MAX_VIEW_NOTES, description="All notes in the 3D view, in place of those there are."
+    )
 
 
 class RetryRequest(RequestBody):
@@ -231,6 +250,7 @@ class JobView(JobSummary):
         }
     )
 
+    view_notes: list[ViewNote] = Field([], description="What people wrote at places of the 3D view.")
     options: dict[str, Any] = Field(
         description="Every setting: as resolved where the job ran, or as this version would resolve it."
     )

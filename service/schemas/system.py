@@ -5,6 +5,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, Field
 
+from octasplat.service.schemas.base import RequestBody
+
 
 class KindView(BaseModel):
     """A kind of job."""
@@ -57,6 +59,7 @@ class QueueView(BaseModel):
     oldest_seconds: float | None = Field(description="How long the first of them has waited.")
     running: int = Field(description="Your jobs that run; everybody's for administrators.")
     slots: int = Field(description="Jobs that the live workers of the queue do at once.")
+    paused: bool = Field(False, description="Whether it hands out no jobs; those that run go on.")
 
 
 class WorkerView(BaseModel):
@@ -66,6 +69,8 @@ class WorkerView(BaseModel):
     queues: list[str]
     slots: int
     facts: dict[str, Any]
+    running: int = Field(0, description="Jobs that it has.")
+    drained: bool = Field(False, description="Whether it finishes what it has and takes nothing new.")
     started_at: datetime
     seen_at: datetime
 
@@ -75,6 +80,18 @@ class QueueList(BaseModel):
 
     queues: list[QueueView]
     workers: list[WorkerView] = Field(description="Shown to administrators; empty for others.")
+
+
+class QueueChange(RequestBody):
+    """Change of a queue."""
+
+    paused: bool = Field(description="Whether it is to hand out no jobs.")
+
+
+class WorkerChange(RequestBody):
+    """Change of a worker."""
+
+    drained: bool = Field(description="Whether it is to finish what it has and take nothing new.")
 
 
 class Health(BaseModel):

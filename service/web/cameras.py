@@ -9,6 +9,7 @@ import io
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import IO, Any
 
 import numpy as np
@@ -92,10 +93,20 @@ def _pose_of_view(view: Mapping[str, Any], cameras: Sequence[Mapping[str, Any]])
     return PhotographPose(str(view["name"]), rotation, centre, intrinsics.fov_y_degrees, intrinsics.aspect)
 
 
-def viewer_cameras(poses: list[PhotographPose], held_out: Iterable[str] = ()) -> dict[str, object]:
+def viewer_cameras(
+    poses: list[PhotographPose],
+    held_out: Iterable[str] = (),
+    nearest_world: Mapping[str, float] = MappingProxyType({}),
+) -> dict[str, object]:
     """Return what the viewer needs: the up direction, a point to look at, and the views, as JSON values.
 
-    The point is the one nearest to all their optical axes; it
+    Args:
+        poses: of the photographs.
+        held_out: names of those that training never sees.
+        nearest_world: the distance at which the sparse points around each camera begin, by name, as far as
+            it is known.
+
+    The point to look at is the one nearest to all their optical axes; it
     is pulled before the cameras where these look the same way and share no such point.
     """
     centres = np.stack([pose.centre_world for pose in poses])
@@ -131,6 +142,7 @@ def viewer_cameras(poses: list[PhotographPose], held_out: Iterable[str] = ()) ->
                 "fov_y_degrees": round(pose.fov_y_degrees, 4),
                 "aspect": round(pose.aspect, 5),
                 "held_out": pose.name in held,
+                "nearest_world": nearest_world.get(pose.name, 0.0),
             }
             for pose in selected
         ],

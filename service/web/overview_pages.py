@@ -1,4 +1,4 @@
-"""Pages besides those of single jobs: variants side by side, datasets, usage, and changes of several jobs."""
+"""Pages besides those of single jobs: variants, datasets, usage, administration, several jobs at once."""
 
 import urllib.parse
 import uuid
@@ -9,9 +9,9 @@ from fastapi import APIRouter, Query, Request, Response
 from octasplat.engine.core.errors import OctasplatError
 from octasplat.service.actions import datasets as dataset_actions
 from octasplat.service.actions import jobs as job_actions
-from octasplat.service.actions.system import list_queues
+from octasplat.service.actions.system import list_queues, set_queue_paused, set_worker_drained
 from octasplat.service.actions.usage import read_usage
-from octasplat.service.auth import Reader, Writer
+from octasplat.service.auth import Admin, Reader, Writer
 from octasplat.service.paging import decode_id_cursor, encode_cursor
 from octasplat.service.problems import ProblemError, problem_from_error
 from octasplat.service.state import ServiceDep
@@ -73,7 +73,7 @@ async def delete_dataset(
 
 @router.get("/usage")
 async def show_usage(request: Request, principal: Reader, service: ServiceDep) -> Response:
-    """Return the page of what the owner takes and may take, the queues, and the workers."""
+    """Return the page of what the owner takes and may take, and the queues."""
     return render_page(
         request,
         "usage.html",
@@ -81,6 +81,31 @@ async def show_usage(request: Request, principal: Reader, service: ServiceDep) -
         usage=await read_usage(service, principal),
         queues=await list_queues(service, principal),
     )
+
+
+@router.get("/admin")
+async def show_admin(request: Request, principal: Admin, service: ServiceDep) -> Response:
+    """Return the page of the queues and the workers, with what pauses and drains them."""
+    queues = await list_queues(service, principal)
+    return render_page(request, "admin.html", principal, queues=queues)
+
+
+@router.post("/admin/queues/{queue}")
+async def pause_queue(
+    request: Request, queue: str, principal: Admin, service: ServiceDep, paused: bool
+) -> Response:
+    """Pause a queue or let it go on, and return to the page."""
+    await set_queue_paused(service, principal, queue, paused)
+    return redirect(request, "/admin")
+
+
+@router.post("/admin/workers/{worker}")
+async def drain_worker(
+    request: Request, worker: str, principal: Admin, service: ServiceDep, drained: bool
+) -> Response:
+    """Drain a worker or let it take jobs again, and return to the page."""
+    await set_worker_drained(service, principal, worker, drained)
+    return redirect(request, "/admin")
 
 
 @router.post("/jobs/chosen")

@@ -3,15 +3,14 @@
 import json
 import urllib.parse
 import uuid
-from pathlib import PurePosixPath
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import HTMLResponse, JSONResponse
 
-from octasplat.engine.core.scene_layout import FileRole, file_role
+from octasplat.engine.operations.clean import CleanOptions
 from octasplat.service.actions import jobs as actions
-from octasplat.service.actions.artifacts import get_artifact, list_artifacts
+from octasplat.service.actions.artifacts import find_live_scene, get_artifact, list_artifacts
 from octasplat.service.actions.datasets import list_datasets
 from octasplat.service.actions.submission import retry_job
 from octasplat.service.actions.system import list_live_workers
@@ -23,13 +22,8 @@ from octasplat.service.queue_workers import unwritable_formats
 from octasplat.service.schemas.jobs import JobChange, RetryRequest
 from octasplat.service.state import Service, ServiceDep
 from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
-from octasplat.service.web.cameras import (
-    CamerasUnreadableError,
-    read_poses,
-    read_view_poses,
-    viewer_cameras,
-)
 from octasplat.service.web.forms import KINDS_WITH_OWN_FORM, options_form
+from octasplat.service.web.job_cameras import viewer_cameras_of_job
 from octasplat.service.web.relight_form import relight_form
 from octasplat.service.web.results import (
     CONFIG,
@@ -48,9 +42,8 @@ from octasplat.service.web.results import (
 from octasplat.service.web.routing import PageRoute, is_htmx_request, redirect
 from octasplat.service.web.stage_form import stage_form
 from octasplat.service.web.templating import render_page
-from octasplat.service.web.view_models import job_counts, job_detail, list_job_rows, photographs_of
-from octasplat.workers.db.rows import Artifact, DatasetFile
-from octasplat.workers.storage.errors import StorageError
+from octasplat.service.web.view_models import ACTIVE, job_counts, job_detail, list_job_rows, photographs_of
+from octasplat.workers.db.rows import Artifact
 from octasplat.workers.worker.job_kinds import get_job_kind, job_kinds
 
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
@@ -114,9 +107,10 @@ async def show_job(request: Request, job_id: uuid.UUID, principal: Reader, servi
     photographs = await photographs_of(service, principal, job_id)
     unwritable = unwritable_formats(await list_live_workers(service))
     by_name = {row.name: row for row in artifacts}
-    metrics, config = await run_in_pool(
+    live = await find_live_scene(service, principal, job_id)
+    metrics, config, views = await run_in_pool(
         ThreadPurpose.DOWNLOADS,
-        lambda: [read_json(service.storage, by_name.get(name)) for name in (METRICS, CONFIG)],
+        lambda: [read_json(service.storage, by_name.get(name)) for name in (METRICS, CONFIG, VIEWS)],
     )
     held_out = await run_in_pool(ThreadPurpose.DOWNLOADS, read_names, service.storage, by_name.get(HELD_OUT))
     figures = read_measurements(metrics, artifacts, photographs)
@@ -145,6 +139,12 @@ async def show_job(request: Request, job_id: uuid.UUID, principal: Reader, servi
         ],
         groups=download_groups(artifacts),
         scene=by_name.get(SCENE),
+        live=live,
+        view_notes=[note.model_dump() for note in detail.line.job.view_notes],
+        shows_live=detail.line.job.kind == "reconstruct"
+        and detail.line.job.state != "succeeded"
+        and (live is not None or detail.line.job.state in ACTIVE),
+        edit=_edit_values(views) if SCENE in by_name and principal.may("write") else None,
         mesh=viewable_mesh(artifacts),
         report=by_name.get(REPORT),
         video=next((row for row in artifacts if row.media_type == "video/mp4"), None),
@@ -186,10 +186,11 @@ async def get_cameras(job_id: uuid.UUID, principal: Reader, service: ServiceDep)
     artifacts = await list_artifacts(service, principal, job_id)
     files = await photographs_of(service, principal, job_id)
     held_out = next((row for row in artifacts if row.name == HELD_OUT), None)
+    live = await find_live_scene(service, principal, job_id)
     content = await run_in_pool(
-        ThreadPurpose.DOWNLOADS, viewer_cameras_of_job, service, artifacts, files, held_out
+        ThreadPurpose.DOWNLOADS, viewer_cameras_of_job, service, artifacts, files, held_out, live
     )
-    headers = {"Cache-Control": "private, max-age=300"}
+    headers = {"Cache-Control": "private, max-age=300" if live is None else "no-cache"}
     return JSONResponse(content, headers=headers)
 
 
@@ -290,51 +291,13 @@ def _evaluation_background(config: dict[str, object]) -> object:
     return found or _config_value(config, "reconstruction", "evaluate_background") or "black"
 
 
+def _edit_values(views: dict[str, Any]) -> dict[str, object]:
+    """Return what the form of crop and clean begins with: the scene's local origin, and the usual options."""
+    found = views.get("origin_world")
+    known = isinstance(found, list) and len(found) == 3 and all(isinstance(x, int | float) for x in found)
+    return {"origin": found if known else [0, 0, 0], "clean": CleanOptions().model_dump(mode="json")}
+
+
 def _octagon_q(config: dict[str, object]) -> float | None:
     found = _config_value(config, "reconstruction", "train", "trace", "q")
     return float(found) if isinstance(found, int | float) and found > 0 else None
-
-
-def viewer_cameras_of_job(
-    service: Service, artifacts: list[Artifact], files: list[DatasetFile], held_out: Artifact | None
-) -> dict[str, object]:
-    """Return the cameras that the job's result keeps, else of its poses or its dataset; none without any.
-
-    Only the first are about the local origin of a scene with large coordinates, as the scene is, and there
-    whatever form the poses of the dataset have.
-    """
-    names = read_names(service.storage, held_out)
-    views = next((row for row in artifacts if row.name == VIEWS), None)
-    if views is not None and (poses := read_view_poses(read_json(service.storage, views))):
-        return viewer_cameras(poses, names)
-    found = {PurePosixPath(row.name).name: row.sha256 for row in artifacts if row.name.startswith("poses/")}
-    if not found:
-        found = {name: row.sha256 for name, row in _model_files(files).items()}
-    for suffix in (".bin", ".txt"):
-        if f"cameras{suffix}" not in found or f"images{suffix}" not in found:
-            continue
-        try:
-            with (
-                service.storage.open(found[f"cameras{suffix}"]) as cameras,
-                service.storage.open(found[f"images{suffix}"]) as images,
-            ):
-                poses = read_poses(cameras, images, binary=suffix == ".bin")
-        except (CamerasUnreadableError, StorageError):
-            break
-        if poses:
-            return viewer_cameras(poses, names)
-    return {"views": []}
-
-
-def _model_files(files: list[DatasetFile]) -> dict[str, DatasetFile]:
-    """Return the files of the model with the most of images, by their last part."""
-    models: dict[PurePosixPath, dict[str, DatasetFile]] = {}
-    for file in files:
-        if file_role(file.path) is FileRole.MODEL:
-            path = PurePosixPath(file.path)
-            models.setdefault(path.parent, {})[path.name] = file
-
-    def image_bytes(model: dict[str, DatasetFile]) -> int:
-        return max((file.size_bytes for name, file in model.items() if name.startswith("images.")), default=0)
-
-    return max(models.values(), key=image_bytes, default={})

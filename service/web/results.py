@@ -19,8 +19,8 @@ logger = logging.getLogger(__name__)
 
 MAX_JSON_BYTES = 16 << 20
 VIEWS = "views.json"
-SCENE, METRICS, REPORT, CONFIG, HELD_OUT = (
-    "scene.ply", "metrics.json", "report.html", "config.json", "held_out.json",
+SCENE, METRICS, REPORT, CONFIG, HELD_OUT, TRAINING = (
+    "scene.ply", "metrics.json", "report.html", "config.json", "held_out.json", "training.json",
 )  # fmt: skip
 LAYERS: Mapping[str, str] = {
     "normal": "Normals",
@@ -124,6 +124,17 @@ def read_names(storage: Storage, row: Artifact | None) -> list[str]:
     """Return the names in a small JSON result; none if it cannot be read."""
     content = _read_json(storage, row)
     return [str(name) for name in content] if isinstance(content, list) else []
+
+
+def read_json_content(storage: Storage, sha256: str) -> dict[str, Any]:
+    """Return a small JSON content that is soon replaced, and so not cached; empty if it cannot be read."""
+    try:
+        if storage.stat(sha256).size_bytes > MAX_JSON_BYTES:
+            return {}
+        content = json.loads(b"".join(storage.read(sha256)))
+    except (StorageError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
 
 
 def _read_json(storage: Storage, row: Artifact | None) -> object:

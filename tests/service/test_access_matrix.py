@@ -25,7 +25,13 @@ from tests.support.service_harness import (
 
 OPEN = {"/healthz", "/readyz"}
 """Whoever watches over the service needs no token for these."""
-ADMIN = {"POST /v1/tokens", "GET /v1/audit", "GET /metrics"}
+ADMIN = {
+    "POST /v1/tokens",
+    "GET /v1/audit",
+    "GET /metrics",
+    "PATCH /v1/queues/{queue}",
+    "PATCH /v1/workers/{worker}",
+}
 """These need an administrator's token; a route that belongs here and is missing fails the test."""
 HARMLESS = {"POST /v1/estimates"}
 """These change nothing though they are no GET."""
@@ -69,7 +75,7 @@ class Stage:
         await attempt.succeed([ResultFile("scene.ply", sha256, size, "application/octet-stream")])
         self.ids = {
             "dataset_id": open_dataset, "job_id": job_id, "path": "images/a.png", "name": "scene.ply",
-            "kind": "toy",
+            "kind": "toy", "queue": "cpu", "worker": "box",
         }  # fmt: skip
         hook = await self._make("/v1/webhooks", {"url": "https://example.org/hook"})
         tried = await self.http.post(f"/v1/webhooks/{hook}/test", headers=self.headers["owner"])

@@ -9,6 +9,7 @@ from octasplat.service.web.comparison import differing_settings
 from octasplat.workers.db.connections import open_pool
 from octasplat.workers.db.datasets import create_dataset, put_file
 from octasplat.workers.db.tokens import add_token
+from octasplat.workers.db.workers import record_worker_heartbeat
 from octasplat.workers.queue.jobs import NewJob, create_job
 from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
 from tests.support.service_harness import ConnectService
@@ -108,17 +109,47 @@ async def test_datasets_are_listed_with_their_size_and_deleted(
         assert "chair" not in (await http.get("/datasets")).text
 
 
-async def test_usage_shows_workers_to_administrators_only(
+async def test_queues_and_workers_are_for_administrators_only(
     connect_service: ConnectService, database: str
 ) -> None:
     async with connect_service() as (http, _):
         page = (await http.get("/usage")).text
-        assert "Unfinished jobs" in page and "Queues" in page and "Workers</h2>" in page
+        assert "Unfinished jobs" in page and "Queues" in page and 'href="/admin"' in page
+        assert "Workers</h2>" in (await http.get("/admin")).text
         async with open_pool(database, max_size=1, wait_seconds=10) as pool, pool.connection() as connection:
             secret = "anna-" + uuid.uuid4().hex
             await add_token(connection, secret, owner="anna", name="anna", scopes=("write",))
         page = (await http.get("/usage", headers={"Authorization": f"Bearer {secret}"})).text
-        assert "<b>anna</b>" in page and "Workers</h2>" not in page
+        assert "<b>anna</b>" in page and 'href="/admin"' not in page
+        for method, path in (("GET", "/admin"), ("POST", "/admin/queues/cpu?paused=true")):
+            refused = await http.request(method, path, headers={"Authorization": f"Bearer {secret}"})
+            assert refused.status_code == 403, path
+
+
+async def test_queue_is_paused_and_worker_drained_on_the_page(
+    connect_service: ConnectService, database: str
+) -> None:
+    async with connect_service() as (http, _):
+        job = await make_job(database, label="waits", queue="night")
+        async with open_pool(database, max_size=1, wait_seconds=10) as pool, pool.connection() as connection:
+            await record_worker_heartbeat(
+                connection, uuid.uuid4(), name="box 1", queues=["night"], slots=2, facts={}
+            )
+        done = await http.post("/admin/queues/night?paused=true", follow_redirects=False)
+        assert (done.status_code, done.headers["location"]) == (303, "/admin")
+        await http.post("/admin/workers/box 1?drained=true", follow_redirects=False)
+        found = (await http.get("/v1/queues")).json()
+        assert [row["queue"] for row in found["queues"] if row["paused"]] == ["night"]
+        assert [(row["name"], row["drained"]) for row in found["workers"]] == [("box 1", True)]
+        page = (await http.get("/admin")).text
+        assert "Let go on the queue night" in page and "Let take jobs: the worker box 1" in page
+        notes = (await http.get(f"/v1/jobs/{job}")).json()["notes"]
+        assert notes[0] == "An administrator has paused the queue night; the job waits until it goes on."
+        await http.post("/admin/queues/night?paused=false")
+        notes = (await http.get(f"/v1/jobs/{job}")).json()["notes"]
+        assert "All workers of the queue night are being drained; the job waits for another one." in notes
+        gone = await http.patch("/v1/workers/nobody", json={"drained": True})
+        assert gone.status_code == 404
 
 
 async def test_form_of_a_new_job_has_the_settings_of_another(

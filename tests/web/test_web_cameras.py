@@ -18,7 +18,7 @@ from octasplat.service.web.cameras import (
     read_poses,
     viewer_cameras,
 )
-from octasplat.service.web.pages import viewer_cameras_of_job
+from octasplat.service.web.job_cameras import viewer_cameras_of_job
 
 UP = np.array([0.0, 0.0, 1.0])
 CENTRES = [(3.0, 0.0, 1.0), (0.0, 3.0, 2.0), (-3.0, 0.5, 1.5), (0.5, -3.0, 0.7)]

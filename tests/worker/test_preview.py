@@ -13,6 +13,7 @@ from PIL import Image
 from octasplat.engine.core.events import Event
 from octasplat.engine.core.rays import ImageRays, RayBatch
 from octasplat.engine.dataset import Dataset
+from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.operations.reconstruct import options_from_json
 from octasplat.engine.pipeline import OnStep, reconstruct
 from octasplat.engine.runs.config import ReconstructionConfig
@@ -58,7 +59,9 @@ def config() -> ReconstructionConfig:
 def watched(clock: Clock, previews: PreviewRenderer, seconds: float) -> OnStep:
     """Every iteration takes so many seconds."""
 
-    def watch(iteration: int, dataset: Dataset, tracer: Tracer, shading: ShadingModel) -> None:
+    def watch(
+        iteration: int, dataset: Dataset, tracer: Tracer, shading: ShadingModel, _gaussians: FlatGaussians
+    ) -> None:
         clock.now += seconds
         previews(iteration, dataset, tracer, shading)
 

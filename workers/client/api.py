@@ -131,6 +131,10 @@ class Api:
         headers = {"Idempotency-Key": key or uuid.uuid4().hex}
         return self.request("POST", path, json=body, headers=headers)
 
+    def patch(self, path: str, body: Any) -> Any:
+        """Return the JSON of a PATCH."""
+        return _response_json(self.request("PATCH", path, json=body))
+
     def request(self, method: str, path: str, **arguments: Any) -> httpx.Response:
         """Send a request, again while the service is away or busy; bodies must be content or JSON.
 

@@ -8,7 +8,7 @@ from octasplat.workers.storage.fsck import Reference
 
 
 async def references(connection: Connection) -> AsyncIterator[Reference]:
-    """Return the references of dataset files, results, checkpoints and previews."""
+    """Return the references of dataset files, results, checkpoints, previews and live scenes."""
     async with connection.transaction():
         async with connection.cursor("dataset_files") as cursor:
             await cursor.execute("SELECT dataset_id, path, sha256, size_bytes FROM dataset_files")
@@ -27,6 +27,11 @@ async def references(connection: Connection) -> AsyncIterator[Reference]:
             async for row in cursor:
                 for reference in _job_references(row):
                     yield reference
+        async with connection.cursor("live_scenes") as cursor:
+            await cursor.execute("SELECT job_id, sha256, views_sha256 FROM live_scenes")
+            async for row in cursor:
+                for content in (row["sha256"], row["views_sha256"]):
+                    yield Reference(f"job {row['job_id']} live scene", content)
 
 
 def _job_references(row: dict[str, Any]) -> list[Reference]:

@@ -1,7 +1,7 @@
 """Rows of the tables, as they are read."""
 
 import uuid
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, Literal
 
@@ -111,6 +111,7 @@ class Job:
         version: counts changes but heartbeats.
         waits_for: why it is in the queue again, or was left there by a worker; None for a job that waits for
             its turn.
+        view_notes: what people wrote at places of the 3D view: ``text``, ``position``, ``camera``.
         begun_anew: why an attempt did not go on from the checkpoint that there was.
     """
 
@@ -154,6 +155,7 @@ class Job:
     waits_for: str | None = None
     begun_anew: str | None = None
     requested: dict[str, Any] | None = None
+    view_notes: list[dict[str, Any]] = field(default_factory=list)
 
     @property
     def is_over(self) -> bool:

@@ -38,6 +38,7 @@ _CONTENTS_QUERY = """
     SELECT sha256 FROM dataset_files UNION SELECT sha256 FROM artifacts
     UNION SELECT file->>'sha256' FROM jobs, jsonb_array_elements(checkpoint->'files') AS file
     UNION SELECT preview->>'sha256' FROM jobs WHERE preview ? 'sha256'
+    UNION SELECT sha256 FROM live_scenes UNION SELECT views_sha256 FROM live_scenes
 """
 
 
@@ -50,7 +51,10 @@ _PLACES_QUERY = """
     SELECT 'The checkpoint of the job ' || id FROM jobs, jsonb_array_elements(checkpoint->'files') AS file
     WHERE file->>'sha256' = %(sha256)s
     UNION ALL
-    SELECT 'The preview of the job ' || id FROM jobs WHERE preview->>'sha256' = %(sha256)s LIMIT 1
+    SELECT 'The preview of the job ' || id FROM jobs WHERE preview->>'sha256' = %(sha256)s
+    UNION ALL
+    SELECT 'The live scene of the job ' || job_id FROM live_scenes
+    WHERE %(sha256)s IN (sha256, views_sha256) LIMIT 1
 """
 
 

@@ -227,6 +227,8 @@ async def _referenced_now(connection: Connection, contents: Sequence[str]) -> se
         """
         SELECT sha256 FROM owner_contents WHERE sha256 = ANY(%(contents)s)
         UNION SELECT preview->>'sha256' FROM jobs WHERE preview->>'sha256' = ANY(%(contents)s)
+        UNION SELECT sha256 FROM live_scenes WHERE sha256 = ANY(%(contents)s)
+        UNION SELECT views_sha256 FROM live_scenes WHERE views_sha256 = ANY(%(contents)s)
         """,
         {"contents": list(contents)},
     )

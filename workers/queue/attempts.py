@@ -12,6 +12,7 @@ from typing import Any
 
 from octasplat.workers.db.connections import Connection, Pool
 from octasplat.workers.db.events_and_logs import add_event, add_log_lines, trim_log
+from octasplat.workers.db.live_scenes import LiveScene, put_live_scene
 from octasplat.workers.db.locks import lock_owner
 from octasplat.workers.db.postgres_text import as_json, storable_text
 from octasplat.workers.db.quotas import NO_QUOTA, Quota, check_bytes
@@ -140,6 +141,14 @@ class Attempt:
                 "UPDATE jobs SET preview = %s WHERE id = %s", [as_json(dict(preview)), job.id]
             )
             await add_event(connection, job.id, job.attempt, "preview", preview)
+
+    async def record_live_scene(self, scene: LiveScene, lease: StorageLease | None = None) -> None:
+        """Record the newest state of the training; ``lease`` as above."""
+        contents = [scene.sha256, scene.views_sha256]
+        async with self._fenced_transaction(lease, contents) as (connection, job):
+            await put_live_scene(connection, scene)
+            told = {"step": scene.step, "gaussians": scene.gaussians}
+            await add_event(connection, job.id, job.attempt, "live_scene", told)
 
     async def record_begun_anew(self, reason: str) -> None:
         """Record why the attempt does not go on from the checkpoint of an earlier one."""

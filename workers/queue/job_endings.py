@@ -5,6 +5,7 @@ from typing import Any
 
 from octasplat.workers.db.connections import Connection
 from octasplat.workers.db.events_and_logs import add_event, add_log_lines
+from octasplat.workers.db.live_scenes import remove_live_scene
 from octasplat.workers.db.postgres_text import as_json_or_null
 from octasplat.workers.db.rows import Job
 from octasplat.workers.queue.jobs import requeue_job
@@ -26,6 +27,8 @@ async def end_job(connection: Connection, job: Job, state: str, error: Mapping[s
         """,
         [state, as_json_or_null(error), state == "succeeded", job.id],
     )
+    if state == "succeeded":
+        await remove_live_scene(connection, job.id)
     data: dict[str, Any] = {"state": state}
     if error is not None:
         data["error"] = dict(error)

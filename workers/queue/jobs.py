@@ -314,15 +314,23 @@ async def requeue_job(
     await add_event(connection, job.id, job.attempt, "state", {"state": "queued"})
 
 
-async def change_job(connection: Connection, job_id: uuid.UUID, *, label: str | None, pinned: bool) -> Job:
-    """Set the label of a job, and whether it is pinned; a pinned job does not expire."""
+async def change_job(
+    connection: Connection,
+    job_id: uuid.UUID,
+    *,
+    label: str | None,
+    pinned: bool,
+    view_notes: Sequence[Mapping[str, Any]] | None = None,
+) -> Job:
+    """Set the label of a job, whether it is pinned, and its notes if given; a pinned job does not expire."""
     await connection.execute(
         """
         UPDATE jobs SET label = %(label)s, pinned = %(pinned)s,
+            view_notes = coalesce(%(view_notes)s, view_notes),
             expires_at = CASE WHEN %(pinned)s THEN NULL ELSE expires_at END
         WHERE id = %(id)s
         """,
-        {"label": label, "pinned": pinned, "id": job_id},
+        {"label": label, "pinned": pinned, "view_notes": as_json_or_null(view_notes), "id": job_id},
     )
     return await _get_job_or_raise(connection, job_id)
 
@@ -391,6 +399,17 @@ async def running_by_queue(connection: Connection, owner: str | None = None) -> 
         {"owner": owner},
     )
     return {row["queue"]: row["n"] for row in await cursor.fetchall()}
+
+
+async def running_by_worker(connection: Connection) -> dict[str, int]:
+    """Return the number of running jobs by the name of their worker."""
+    cursor = await connection.execute(
+        """
+        SELECT worker, count(*) AS n FROM jobs
+        WHERE state IN ('running', 'canceling') AND worker IS NOT NULL GROUP BY worker
+        """
+    )
+    return {row["worker"]: row["n"] for row in await cursor.fetchall()}
 
 
 async def worked_seconds(connection: Connection, owner: str) -> float:

@@ -18,17 +18,30 @@ from octasplat.engine.core.events import (
 )
 from octasplat.engine.core.progress import counted_phase, stop_when_asked
 from octasplat.engine.core.writing import write_json
+from octasplat.engine.dataset import Dataset
+from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.pipeline import reconstruct as reconstruct_scene
 from octasplat.engine.runs.config import ReconstructionConfig
-from octasplat.engine.runs.run_folder import CACHE, CHECKPOINTS, CONFIG, EVENTS, SCENE
+from octasplat.engine.runs.run_folder import (
+    CACHE,
+    CHECKPOINTS,
+    CONFIG,
+    EVENTS,
+    SCENE,
+    found_model_folder,
+)
+from octasplat.engine.shading.protocol import ShadingModel
+from octasplat.engine.trace.protocol import Tracer
 from octasplat.workers.worker.job_kinds import get_job_kind
 from octasplat.workers.worker.job_kinds.operation_kind import OperationKind
+from octasplat.workers.worker.live_scene import LiveSceneWriter
 from octasplat.workers.worker.path_redaction import PathRedactor
 from octasplat.workers.worker.preview import PreviewRenderer
 from octasplat.workers.worker.stored_frames import write_moved_results
 from octasplat.workers.worker.task import INFO_FILE, Task
 
 REPORT = "report.html"
+_STAGES_OF_POSES = ("poses", "placing", "lenses", "load")
 
 
 def reconstruct(task: Task) -> None:
@@ -53,6 +66,22 @@ def _run_reconstruction(task: Task) -> None:
     assert task.scene is not None
     config = ReconstructionConfig.model_validate(task.options)
 
+    preview = PreviewRenderer(task.run, config.evaluation_background, task.progress)
+    live = LiveSceneWriter(task.run, task.progress)
+
+    def show_step(
+        iteration: int, dataset: Dataset, tracer: Tracer, shading: ShadingModel, gaussians: FlatGaussians
+    ) -> None:
+        preview(iteration, dataset, tracer, shading)
+        live(iteration, dataset, gaussians)
+
+    def show_points(event: Event) -> None:
+        # As soon as poses are found, and again where they are mended; never in the place of a later state.
+        if isinstance(event, PhaseFinished) and event.stage in _STAGES_OF_POSES:
+            assert task.scene is not None
+            if not any((task.run / CHECKPOINTS).glob("*.npz")):
+                live.write_points(task.scene, found_model_folder(task.run))
+
     def publish_finished(event: Event) -> None:
         # Whatever becomes of the rest, even if this process is killed.
         if isinstance(event, PhaseFinished) or (isinstance(event, PhaseProgress) and event.stage == "export"):
@@ -66,9 +95,11 @@ def _run_reconstruction(task: Task) -> None:
                 config,
                 resume=True,
                 threads=task.threads,
-                progress=stop_when_asked(broadcast([task.progress, publish_finished]), task.should_stop),
+                progress=stop_when_asked(
+                    broadcast([task.progress, publish_finished, show_points]), task.should_stop
+                ),
                 should_stop=task.should_stop,
-                on_step=PreviewRenderer(task.run, config.evaluation_background, task.progress),
+                on_step=show_step,
             )
     finally:
         _publish_run(task)

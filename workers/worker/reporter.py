@@ -8,7 +8,7 @@ import asyncio
 import contextlib
 import logging
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import psycopg
@@ -16,6 +16,7 @@ from psycopg_pool import PoolTimeout
 
 from octasplat.engine.core.events import Warned
 from octasplat.workers.cancellation import cancel_and_wait
+from octasplat.workers.db.live_scenes import LiveScene
 from octasplat.workers.db.quotas import QuotaExceededError
 from octasplat.workers.queue.attempts import Attempt, FencedError
 from octasplat.workers.queue.storage_leases import storage_lease
@@ -65,6 +66,7 @@ class Reporter:
         self._steps = 0
         self._wanted_checkpoint: tuple[str, int] | None = None
         self._preview: dict[str, Any] | None = None
+        self._live_scene: dict[str, Any] | None = None
         self._checkpoint: Checkpoint | None = None
         self._stores_checkpoints = True
         self._wake = asyncio.Event()
@@ -141,6 +143,9 @@ class Reporter:
         elif kind == "preview_written":
             self._preview = event
             self._wake.set()
+        elif kind == "live_scene_written":
+            self._live_scene = event
+            self._wake.set()
         if kind in _STORED_EVENT_KINDS:
             self._events.append((kind, {key: value for key, value in event.items() if key != "kind"}))
 
@@ -211,6 +216,7 @@ class Reporter:
         """Store the newest checkpoint and picture, if there are new ones."""
         pending, self._wanted_checkpoint = self._wanted_checkpoint, None
         preview, self._preview = self._preview, None
+        live_scene, self._live_scene = self._live_scene, None
         try:
             if pending is not None:
                 await self._store_checkpoint(*pending)
@@ -221,6 +227,8 @@ class Reporter:
                     )
                     row = {"sha256": sha256, "step": preview["step"], "view": preview["view"]}
                     await self._attempt.record_preview(row, note)
+            if live_scene is not None:
+                await self._store_live_scene(live_scene)
         except asyncio.CancelledError:
             self._wanted_checkpoint, self._preview = (
                 self._wanted_checkpoint or pending,
@@ -231,6 +239,17 @@ class Reporter:
             logger.warning("checkpoint of job %s was not stored: %s", self._attempt.job.id, error)
             self.add_note(f"Warning: a checkpoint could not be stored: {error}")
             self._wanted_checkpoint = self._wanted_checkpoint or pending
+
+    async def _store_live_scene(self, event: Mapping[str, Any]) -> None:
+        async with storage_lease(self._attempt.pool, self._workspace.storage) as note:
+            sha256, views_sha256 = [
+                await asyncio.to_thread(self._workspace.store_file, f"{RUN_FOLDER}/{event[name]}")
+                for name in ("path", "views")
+            ]
+            scene = LiveScene(
+                self._attempt.job.id, sha256, views_sha256, int(event["step"]), int(event["gaussians"])
+            )
+            await self._attempt.record_live_scene(scene, note)
 
     async def _store_checkpoint(self, stage: str, step: int) -> None:
         if not self._stores_checkpoints:

@@ -13,6 +13,7 @@ import time
 import uuid
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from octasplat.engine.files import writable_formats
 from octasplat.engine.operations.precompile import cold_start_seconds, kernel_groups
 from octasplat.workers.cancellation import cancel_and_wait
 from octasplat.workers.db.connections import Pool, open_pool
+from octasplat.workers.db.holds import read_holds
 from octasplat.workers.db.ids import new_id
 from octasplat.workers.db.migrate import wait_for_tables
 from octasplat.workers.db.workers import record_worker_heartbeat, remove_stale_workers, remove_worker
@@ -218,7 +220,7 @@ class _Worker:
             host.changed.clear()
             ails = asyncio.create_task(host.changed.wait())
             takers = [
-                asyncio.create_task(job_queue.consume(queue, slots, self._deliver))
+                asyncio.create_task(job_queue.consume(queue, slots, partial(self._deliver, queue)))
                 for queue, slots in self._queues.items()
             ]
             await asyncio.wait({left, ails, *tasks, *takers}, return_when=asyncio.FIRST_COMPLETED)
@@ -247,9 +249,14 @@ class _Worker:
         self._context.draining.set()
         self._context.job_queue.stop()
 
-    async def _deliver(self, job_id: uuid.UUID, entry_id: int) -> None:
+    async def _deliver(self, queue: str, job_id: uuid.UUID, entry_id: int) -> None:
         if self._context.draining.is_set():
             await self._return_to_queue(job_id, entry_id)
+            return
+        if await self._held_back(queue) is not None:
+            # The entry is free for others at once, while this slot asks for no other one.
+            await self._return_to_queue(job_id, entry_id)
+            await self._wait_while_held_back(queue)
             return
         if (fault := await self._context.host_health.check_work_folder()) is not None:
             self._context.host_health.mark_faulty(fault)
@@ -264,6 +271,9 @@ class _Worker:
         ):
             return
         job_id, entry_id = chosen
+        if await self._held_back(queue) is not None:  # room may have been waited for
+            await self._return_to_queue(job_id, entry_id)
+            return
         since = time.monotonic()
         attempt = await claim(self._pool, job_id, entry_id, self._name)
         if attempt is None:
@@ -284,6 +294,20 @@ class _Worker:
                 # Not with the error's text, which may differ each time.
                 reason = f"its worker failed ({type(error).__name__})"
                 await attempt.requeue(self._context.job_queue, reason, max_uncounted=MAX_FORGIVEN_FAILURES)
+
+    async def _held_back(self, queue: str) -> str | None:
+        """Return why an administrator lets this worker take no jobs of a queue; None if it may."""
+        async with self._pool.connection() as connection:
+            return (await read_holds(connection)).reason(queue, self._name)
+
+    async def _wait_while_held_back(self, queue: str) -> None:
+        """Wait until jobs of a queue may be taken again, or none are taken any more at all."""
+        stops = (self._context.draining, self._context.host_health.changed)
+        while not self._is_database_lost and not any(stop.is_set() for stop in stops):
+            await asyncio.sleep(self._settings.poll_seconds)
+            with contextlib.suppress(*DATABASE_ERRORS):
+                if await self._held_back(queue) is None:
+                    return
 
     async def _defer_if_incapable(self, job_id: uuid.UUID, entry_id: int) -> bool:
         """Return whether a job was left to workers of another version."""

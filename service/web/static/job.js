@@ -39,6 +39,12 @@ function showPreview({ step, view }) {
     box.querySelector(".caption").textContent = `${view} at step ${thousands(step)}`;
 }
 
+/** Another state of the training in the 3D view; see viewer/page.js. */
+function showLiveScene({ step, gaussians }) {
+    const count = step ? `Step ${thousands(step)}, ${thousands(gaussians)} Gaussians` : `${thousands(gaussians)} sparse points`;
+    document.getElementById("viewer")?.dispatchEvent(new CustomEvent("scene", { detail: { scene: `${api}/live-scene?step=${step}`, count } }));
+}
+
 function showProgress(event) {
     const section = status();
     const bar = section?.querySelector("progress"), text = section?.querySelector(".bar-text");
@@ -76,6 +82,7 @@ function hear(kind, data, id, isNew) {
         if (training.addHeldOut(data)) redraw();
         if (isNew) showDecibels("live-psnr", data.psnr);
     } else if (kind === "preview" && isNew) showPreview(data);
+    else if (kind === "live_scene" && isNew) showLiveScene(data);
     else if (kind === "state" && isNew && isOver(data.state)) location.reload();
     else if (isNew) refresh();
 }
@@ -91,7 +98,7 @@ async function readPast() {
     }
 }
 
-const KINDS = ["progress", "preview", "state", "stage_started", "stage_finished", "held_out_measured", "warning", "checkpoint", "rescued", "handed_back", "resumed", "stages", "run_finished"];
+const KINDS = ["progress", "preview", "state", "stage_started", "stage_finished", "held_out_measured", "warning", "live_scene", "checkpoint", "rescued", "handed_back", "resumed", "stages", "run_finished"];
 
 function listen() {
     let failures = 0;

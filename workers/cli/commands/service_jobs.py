@@ -89,14 +89,27 @@ def workers(server: str | None, printer: Printer) -> None:
     """List the queues of the service with what waits in them, and its live workers."""
     with connected(server) as api:
         found = api.get("/v1/queues")
-    queues = [(row["queue"], row["waiting"], row["running"], row["slots"]) for row in found["queues"]]
+    queues = [
+        (row["queue"], row["waiting"], row["running"], row["slots"], "paused" if row.get("paused") else "")
+        for row in found["queues"]
+    ]
     live = [
-        (row["name"], ",".join(row["queues"]), row["slots"], local_time(row["started_at"]))
+        (
+            row["name"],
+            ",".join(row["queues"]),
+            row["slots"],
+            local_time(row["started_at"]),
+            "drained" if row.get("drained") else "",
+        )
         for row in found["workers"]
     ]
     lines = [
-        *table_lines(("Queue", "Waiting", "Running", "Slots"), queues),
-        *(["", *table_lines(("Worker", "Queues", "Slots", "Since"), live)] if live else [_NO_WORKERS]),
+        *table_lines(("Queue", "Waiting", "Running", "Slots", "State"), queues),
+        *(
+            ["", *table_lines(("Worker", "Queues", "Slots", "Since", "State"), live)]
+            if live
+            else [_NO_WORKERS]
+        ),
     ]
     printer.print(found, lines, quiet_lines=[row["name"] for row in found["workers"]])
 

@@ -2,8 +2,13 @@
 
 import { OrbitControls, PerspectiveCamera, Vector3 } from "../vendor/three.js";
 import { CameraPath } from "./camera_path.js";
+import { EditPanel } from "./edit_panel.js";
 import { Limits } from "./limits.js";
+import { Marks } from "./marks.js";
+import { Overlay } from "./overlay.js";
 import { Pacing } from "./pacing.js";
+import { Photograph } from "./photograph.js";
+import { linkOf, viewOf } from "./view_link.js";
 import { Walking } from "./walking.js";
 import { CHI2_2_99, Sorting, SplatRenderer } from "./splats.js";
 import { thousands } from "../numbers.js";
@@ -27,7 +32,12 @@ class Viewer extends LoadingViewer {
         this.added = null; // Gaussians of the picture of a resting camera so far
         this.view = -1;
         this.path = new CameraPath();
-        this.startOrAsk();
+        this.overlay = new Overlay(box.querySelector(".overlay"));
+        this.photograph = new Photograph(box, this.place);
+        this.picks = new Map(); // what is to be done with points that are asked for
+        box.addEventListener("scene", ({ detail }) => this.renew(detail));
+        if (box.dataset.scene) this.startOrAsk();
+        else this.say("The scene appears here as soon as the poses of the photographs are known.");
     }
 
     fail(error) {
@@ -39,6 +49,7 @@ class Viewer extends LoadingViewer {
 
     async start() {
         this.say("Loading the scene");
+        this.isLoading = true;
         try {
             this.splats = new SplatRenderer(this.canvas);
         } catch {
@@ -53,25 +64,78 @@ class Viewer extends LoadingViewer {
         } catch (error) {
             this.fail(error);
         }
+        this.isLoading = false;
     }
 
     load(views) {
         const bar = this.veil.querySelector("progress");
         bar.hidden = false;
-        this.worker = new Worker(new URL("./scene_worker.js", import.meta.url), { type: "module" });
+        const worker = new Worker(new URL("./scene_worker.js", import.meta.url), { type: "module" });
+        worker.addEventListener("message", ({ data }) => this.hear(data));
         return new Promise((resolve, reject) => {
-            this.worker.onerror = () => reject(new Error("The scene cannot be loaded."));
-            this.worker.onmessage = ({ data }) => {
-                if (data.scene) resolve(data.scene);
-                else if (data.error) reject(new Error(data.error));
+            worker.onerror = () => reject(new Error("The scene cannot be loaded."));
+            worker.onmessage = ({ data }) => {
+                if (data.scene) {
+                    this.worker?.terminate();
+                    this.worker = worker;
+                    resolve(data.scene);
+                } else if (data.error) reject(new Error(data.error));
                 else if (data.total) {
                     bar.max = data.total;
                     bar.value = data.loaded;
                     this.say(`Loading the scene: ${(data.loaded / 1e6).toFixed(1)} of ${(data.total / 1e6).toFixed(1)} MB`);
                 }
             };
-            this.worker.postMessage({ load: new URL(this.box.dataset.scene, location.href).href, views });
+            worker.postMessage({ load: new URL(this.box.dataset.scene, location.href).href, views });
         });
+    }
+
+    /** What the worker answers besides orders. */
+    hear({ picked, id, edited }) {
+        if (picked !== undefined) {
+            this.picks.get(id)?.(picked);
+            this.picks.delete(id);
+        }
+        if (!edited) return;
+        this.box.dispatchEvent(new CustomEvent("edited", { detail: edited }));
+        this.sorting.forget();
+        this.wake();
+    }
+
+    /** The point of the scene at a place of the canvas, px; null where there is none. */
+    pick(x, y) {
+        const { camera } = this, id = Math.random();
+        camera.updateMatrixWorld();
+        const far = new Vector3((2 * x) / this.canvas.clientWidth - 1, 1 - (2 * y) / this.canvas.clientHeight, 0.5).unproject(camera);
+        const direction = far.sub(camera.position).normalize().toArray();
+        this.worker.postMessage({ pick: { origin: camera.position.toArray(), direction, q: this.q }, id });
+        return new Promise((resolve) => this.picks.set(id, resolve));
+    }
+
+    /** Shows what crop and clean would do; see cleaning.js. */
+    edit(wanted, show) {
+        this.worker.postMessage({ edit: wanted, show });
+    }
+
+    /** Another state of the scene has come: it is shown in the place of the one before, from where the camera is. */
+    async renew({ scene, size, count }) {
+        this.box.dataset.scene = scene;
+        this.box.dataset.size = size ?? this.box.dataset.size;
+        if (!this.frame) {
+            if (!this.isLoading) await this.start();
+        } else if (!this.isLoading) {
+            this.isLoading = true;
+            try {
+                const cameras = await this.loadCameras();
+                const found = await this.load(cameras.views);
+                await this.splats.setScene(found, this.q);
+                this.setScene(found, cameras);
+            } catch (error) {
+                this.place.textContent = error.message; // the state before stays
+            }
+            this.isLoading = false;
+        }
+        if (count) this.box.querySelector(".count").textContent = count;
     }
 
     async loadCameras() {
@@ -85,8 +149,6 @@ class Viewer extends LoadingViewer {
 
     setUp(scene, cameras) {
         this.frame = cameras.views.length ? cameras : frameOf(scene);
-        this.limits = new Limits(this.frame);
-        this.pacing = new Pacing(scene.count);
         this.camera = new PerspectiveCamera(50, 1, this.frame.radius * 2e-3, this.frame.radius * 1e4);
         this.camera.up.fromArray(this.frame.up);
         this.controls = new OrbitControls(this.camera, this.canvas);
@@ -94,6 +156,31 @@ class Viewer extends LoadingViewer {
         this.controls.addEventListener("change", () => this.wake());
         this.controls.addEventListener("start", () => { this.place.textContent = ""; });
         this.walking = new Walking(this.canvas, this.camera, this.controls, this.frame.radius, (action) => this.do(action), () => this.wake());
+        const tools = this.box.querySelector(".tools");
+        tools.hidden = false;
+        tools.addEventListener("click", ({ target }) => target.dataset.do && this.do(target.dataset.do));
+        tools.querySelector(".views").addEventListener("change", ({ target }) => target.value && this.do("view", Number(target.value)));
+        tools.querySelector("[data-do=full]").hidden = !document.fullscreenEnabled;
+        this.splats.setBackground(...BACKGROUNDS[this.background]);
+        this.takeLight();
+        new ResizeObserver(() => this.resize()).observe(this.canvas.parentElement);
+        this.resize();
+        this.marks = new Marks(this);
+        this.setScene(scene, cameras);
+        this.do("reset");
+        this.place.textContent = "";
+        this.followLink();
+        addEventListener("hashchange", () => this.followLink());
+        const panel = document.getElementById("edit");
+        if (panel) this.panel = new EditPanel(panel, this);
+        requestAnimationFrame((now) => this.tick(now));
+    }
+
+    /** What depends on the scene and its cameras, at first and whenever another one has come. */
+    setScene(scene, cameras) {
+        if (cameras.views.length) this.frame = cameras;
+        this.limits = new Limits(this.frame);
+        this.pacing = new Pacing(scene.count);
         this.sorting = new Sorting(this.worker, scene.count, this.q, (order, count, limit) => {
             this.splats.setOrder(order, count);
             this.isOrderWhole = limit === Infinity && !this.sorting.wanted;
@@ -102,19 +189,49 @@ class Viewer extends LoadingViewer {
             this.box.dataset.ready = "yes";
             this.veil.hidden = true;
         });
-        const tools = this.box.querySelector(".tools");
-        tools.hidden = false;
-        tools.addEventListener("click", ({ target }) => target.dataset.do && this.do(target.dataset.do));
-        tools.querySelector("[data-do=previous]").parentElement.hidden = !this.frame.views.length;
-        tools.querySelector("[data-do=full]").hidden = !document.fullscreenEnabled;
-        tools.querySelector(".count").textContent = `${thousands(scene.count)} Gaussians`;
-        this.splats.setBackground(...BACKGROUNDS[this.background]);
-        this.takeLight();
-        new ResizeObserver(() => this.resize()).observe(this.canvas.parentElement);
-        this.resize();
-        this.do("reset");
-        this.place.textContent = "";
-        requestAnimationFrame((now) => this.tick(now));
+        this.scene = scene;
+        this.box.querySelector(".count").textContent = `${thousands(scene.count)} Gaussians`;
+        this.box.querySelectorAll(".with-views").forEach((part) => { part.hidden = !this.frame.views.length || (part.matches(".with-photographs") && !this.box.dataset.photographs); });
+        this.listViews();
+        if (this.overlay.frusta) this.overlay.showFrusta(this.frame.views, this.frame.radius);
+        this.wake();
+    }
+
+    listViews() {
+        const option = (text, value) => Object.assign(document.createElement("option"), { textContent: text, value });
+        const options = this.frame.views.map((view, k) => option(`${view.name}${view.held_out ? " (held out)" : ""}`, k));
+        const chosen = this.box.querySelector(".views").value;
+        this.box.querySelector(".views").replaceChildren(option(`${this.frame.views.length} photographs`, ""), ...options);
+        this.box.querySelector(".views").value = chosen;
+        const unplaced = this.frame.unplaced ?? [], list = this.box.querySelector(".unplaced");
+        list.hidden = !unplaced.length;
+        list.querySelector("summary").textContent = `${unplaced.length} photographs were not placed`;
+        list.querySelector("ul").replaceChildren(...unplaced.map((name) => Object.assign(document.createElement("li"), { textContent: name })));
+    }
+
+    /** Goes to the view that the address names. */
+    followLink() {
+        const view = viewOf(location.hash);
+        if (view) this.goTo(view.position, new Vector3().fromArray(view.target), view.fovY);
+    }
+
+    async copyLink() {
+        const hash = linkOf(this.camera.position.toArray(), this.controls.target.toArray(), this.fovY);
+        history.replaceState(null, "", hash);
+        try {
+            await navigator.clipboard.writeText(location.href);
+            this.place.textContent = "The link to this view is copied.";
+        } catch {
+            this.place.textContent = "The link to this view is in the address bar.";
+        }
+    }
+
+    goTo(position, target, fovY = this.fovY) {
+        this.do("orbit");
+        this.view = -1;
+        this.lookFrom(position, target, fovY, this.aspect ?? 1);
+        this.photograph.leave();
+        this.wake();
     }
 
     /** Where materials can be lit here, whoever has a map says so: {map, degrees}, or a map of null for none. */
@@ -129,13 +246,19 @@ class Viewer extends LoadingViewer {
         this.box.dispatchEvent(new Event("materials"));
     }
 
-    do(action) {
+    do(action, number) {
         if (action === "orbit" || action === "fly") {
             this.walking.setFlying(action === "fly");
             this.box.querySelectorAll("[data-do=orbit], [data-do=fly]").forEach((button) => button.setAttribute("aria-pressed", String(button.dataset.do === action)));
         } else if (action === "toggle-fly") this.do(this.walking.flying ? "orbit" : "fly");
         else if (action === "next" || action === "previous") this.stepView(action === "next" ? 1 : -1);
-        else if (action === "background") {
+        else if (action === "view") this.showView(number);
+        else if (action === "measure" || action === "note") this.marks.toggle(action);
+        else if (action === "link") this.copyLink();
+        else if (action === "cameras") {
+            this.overlay.showFrusta(this.overlay.frusta ? null : this.frame.views, this.frame.radius);
+            this.box.querySelector("[data-do=cameras]").setAttribute("aria-pressed", String(this.overlay.frusta !== null));
+        } else if (action === "background") {
             this.background = this.background === "black" ? "white" : "black";
             this.splats.setBackground(...BACKGROUNDS[this.background]);
         } else if (action === "key") this.tellPath(this.path.add(this.camera));
@@ -177,6 +300,10 @@ class Viewer extends LoadingViewer {
         const distance = Math.max(depth, 0.1 * this.frame.radius);
         this.lookFrom(view.position, position.clone().addScaledVector(forward, distance), view.fov_y_degrees, view.aspect);
         this.place.textContent = `${view.name}${view.held_out ? " (held out)" : ""}`;
+        this.box.querySelector(".views").value = String(index);
+        this.overlay.chosen = index;
+        this.photograph.goTo(view);
+        this.leavesAt = { position: this.camera.position.clone(), quaternion: this.camera.quaternion.clone() };
     }
 
     lookFrom(position, target, fovY, aspect) {
@@ -197,6 +324,8 @@ class Viewer extends LoadingViewer {
         const fits = Math.max(1, (this.aspect ?? 1) / this.camera.aspect);
         this.camera.fov = (360 / Math.PI) * Math.atan(Math.tan(((this.fovY ?? 50) * Math.PI) / 360) * fits);
         this.camera.updateProjectionMatrix();
+        this.overlay.setSize(width, height, Math.min(devicePixelRatio, MAX_PIXEL_RATIO));
+        this.photograph.fit(this.camera);
         this.wake();
     }
 
@@ -216,17 +345,28 @@ class Viewer extends LoadingViewer {
         if (!this.walking.flying) this.controls.update();
         this.limits.clampTarget(this.controls.target);
         if (this.limits.clamp(this.camera.position) && !this.walking.flying) this.camera.lookAt(this.controls.target);
+        if (this.isStale) this.drawOverlay();
         if (this.isBusy || !this.isStale) return;
         this.camera.updateMatrixWorld();
         if (performance.now() - this.movedAt < REST_MS) this.drawMoving();
         else this.drawResting();
     }
 
+    drawOverlay() {
+        const at = this.leavesAt;
+        if (at && (at.position.distanceTo(this.camera.position) > 1e-3 * this.frame.radius || at.quaternion.angleTo(this.camera.quaternion) > 1e-3)) {
+            this.leavesAt = null;
+            this.overlay.chosen = -1;
+            this.photograph.leave();
+        }
+        this.overlay.draw(this.camera);
+    }
+
     /** Draws the heaviest Gaussians with fewer pixels, as many as there is time for. */
     drawMoving() {
         const limit = this.pacing.limit < this.pacing.count ? this.pacing.limit : Infinity;
         this.sort(limit);
-        if (this.splats.ordered > limit) return; // the order of a resting camera is too much to wait for
+        if (!this.splats.ordered || this.splats.ordered > limit) return; // the order of a resting camera is too much to wait for
         this.splats.scale = this.pacing.scale;
         this.splats.render(this.camera);
         this.isStale = false;

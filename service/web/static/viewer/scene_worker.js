@@ -1,12 +1,17 @@
 // Loads a scene and keeps it in order, beside the page: {load, views}, then {position, forward, reach, order,
-// limit} again
-// and again; answers are {loaded, total}, {scene}, {order, count, limit} or {error}.
+// limit} again and again; answers are {loaded, total}, {scene}, {order, count, limit} or {error}. Besides,
+// {pick: {origin, direction, q}, id} is answered by {picked, id}, and {edit, show} by {edited}: what crop and
+// clean would remove is left out of the order, or with the show "removed" all the rest.
 
+import { removedBy } from "./cleaning.js";
+import { pick } from "./picking.js";
 import { readGaussians } from "./ply.js";
 import { makeSorter } from "./sorting.js";
 
 const TRIES = 5;
 let sort = null;
+let scene = null; // {count, geometry, bounds, views}: what picking and editing read
+let hidden = null;
 
 /** All bytes of a file; a download that breaks off goes on where it was. */
 async function download(url, tell) {
@@ -53,9 +58,16 @@ async function load(url, views) {
         told = performance.now();
         postMessage({ loaded, total });
     });
-    const scene = readGaussians(bytes);
-    sort = makeSorter({ ...scene, views }); // before the arrays go to the page
-    postMessage({ scene }, [scene.geometry.buffer, scene.harmonics.buffer, scene.bounds.buffer, ...(scene.materials ? [scene.materials.buffer] : [])]);
+    const read = readGaussians(bytes);
+    sort = makeSorter({ ...read, views }); // before the arrays go to the page
+    scene = { count: read.count, geometry: read.geometry.slice(), bounds: read.bounds.slice(), views: views ?? [] };
+    postMessage({ scene: read }, [read.geometry.buffer, read.harmonics.buffer, read.bounds.buffer, ...(read.materials ? [read.materials.buffer] : [])]);
+}
+
+function edit(wanted, show) {
+    const { removed, counts, kept } = removedBy(scene, scene.views, wanted);
+    hidden = show === "all" ? null : show === "removed" ? removed.map((mark) => 1 - mark) : removed;
+    postMessage({ edited: { counts, kept } });
 }
 
 onmessage = ({ data }) => {
@@ -63,6 +75,14 @@ onmessage = ({ data }) => {
         load(data.load, data.views).catch((error) => postMessage({ error: error.message }));
         return;
     }
-    const count = sort(data.position, data.forward, data.reach, data.order, data.limit);
+    if (data.pick) {
+        postMessage({ picked: pick(scene, data.pick.origin, data.pick.direction, data.pick.q, hidden), id: data.id });
+        return;
+    }
+    if (data.edit) {
+        edit(data.edit, data.show);
+        return;
+    }
+    const count = sort(data.position, data.forward, data.reach, data.order, data.limit, hidden);
     postMessage({ order: data.order, count, limit: data.limit }, [data.order.buffer]);
 };

@@ -27,14 +27,15 @@ export function makeSorter({ count, geometry, bounds, views = [] }) {
     /**
      * Writes the numbers of the Gaussians, the farthest first, and returns how many there are; those wholly
      * behind the camera are left out. `reach` is how many standard deviations an octagon reaches at most; of
-     * all, the `limit` heaviest are taken.
+     * all, the `limit` heaviest are taken; those that `hidden` marks are left out.
      */
-    return function sort(position, forward, reach, order, limit = all) {
+    return function sort(position, forward, reach, order, limit = all, hidden = null) {
         low.fill(0);
         high.fill(0);
         const taken = Math.min(limit, all);
         let seen = 0;
         for (let i = 0; i < taken; i++) {
+            if (hidden?.[numbers[i]]) continue;
             const g = i * 4;
             const depth = (places[g] - position[0]) * forward[0] + (places[g + 1] - position[1]) * forward[1] + (places[g + 2] - position[2]) * forward[2];
             if (!(depth > -places[g + 3] * reach)) continue;
@@ -68,7 +69,7 @@ export function makeSorter({ count, geometry, bounds, views = [] }) {
 export function shownBy(count, geometry, views) {
     const shown = new Uint8Array(count).fill(1);
     const step = Math.max(1, Math.ceil(views.length / MAX_JUDGES));
-    const judges = views.filter((_view, k) => k % step === 0).map(frameOfView);
+    const judges = views.filter((_view, k) => k % step === 0).map((view) => frameOfView(view, FRAME_MARGIN));
     if (judges.length < 3) return shown;
     const least = Math.max(2, MIN_SHARE_OF_VIEWS * judges.length);
     let hidden = 0;
@@ -84,13 +85,15 @@ export function shownBy(count, geometry, views) {
     return hidden > MAX_HIDDEN_SHARE * count ? shown.fill(1) : shown;
 }
 
-function frameOfView({ position, forward, up, fov_y_degrees: fovY, aspect }) {
+/** The image of a view as of cameras.json, `margin` times as large. */
+export function frameOfView({ position, forward, up, fov_y_degrees: fovY, aspect }, margin) {
     const right = [forward[1] * up[2] - forward[2] * up[1], forward[2] * up[0] - forward[0] * up[2], forward[0] * up[1] - forward[1] * up[0]];
-    const tangent = Math.tan((fovY * Math.PI) / 360) * FRAME_MARGIN;
+    const tangent = Math.tan((fovY * Math.PI) / 360) * margin;
     return { position, forward, up, right, y: tangent, x: tangent * aspect };
 }
 
-function isInFrame({ position: p, forward: f, up: u, right: r, x, y }, a, b, c) {
+/** Whether a point lies in such an image. */
+export function isInFrame({ position: p, forward: f, up: u, right: r, x, y }, a, b, c) {
     const dx = a - p[0], dy = b - p[1], dz = c - p[2];
     const depth = dx * f[0] + dy * f[1] + dz * f[2];
     return depth > 0 && Math.abs(dx * r[0] + dy * r[1] + dz * r[2]) < x * depth && Math.abs(dx * u[0] + dy * u[1] + dz * u[2]) < y * depth;

@@ -43,8 +43,7 @@ export class SplatRenderer {
     async setScene(scene, q = CHI2_2_99) {
         const geometry = await this.upload(scene.geometry, scene.count, 3, FloatType);
         const harmonics = await this.upload(scene.harmonics, scene.count, scene.shCount, HalfFloatType);
-        this.mesh?.geometry.dispose();
-        this.scene.clear();
+        this.forget();
         this.order = new Uint32Array(scene.count);
         this.ordered = 0;
         this.mesh = new Mesh(octagons(scene.count), new RawShaderMaterial({
@@ -65,6 +64,14 @@ export class SplatRenderer {
         const uniforms = { geometryTexture, geometryColumns, q: radius, materialTexture: { value: materials.texture }, materialColumns: { value: materials.columns } };
         this.lighting = new Lighting(this.mesh.geometry, uniforms, fullScreen);
         this.lighting.uniforms.background.value = this.background;
+    }
+
+    /** Frees what belongs to the scene before. */
+    forget() {
+        this.scene.clear();
+        if (!this.mesh) return;
+        const { geometryTexture, harmonicsTexture } = this.mesh.material.uniforms;
+        for (const owned of [this.mesh.geometry, this.mesh.material, geometryTexture.value, harmonicsTexture.value]) owned.dispose();
     }
 
     /** Shows materials in the light of a map as of environment.js; null goes back to the harmonics. */
@@ -184,6 +191,11 @@ export class Sorting {
             onOrder(data.order, data.count, data.limit);
             if (this.wanted) this.send();
         };
+    }
+
+    /** Asks for the order anew when a camera is next seen, as other Gaussians are to be drawn. */
+    forget() {
+        this.position.set(Infinity, 0, 0);
     }
 
     /** Asks for the order of the `limit` heaviest as seen by a camera, if it moved; whether it did. */

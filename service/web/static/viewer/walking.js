@@ -4,7 +4,7 @@ import { Vector3 } from "../vendor/three.js";
 
 const TURN_PER_SECOND = 1.1;
 const LOOK_PER_PIXEL = 0.004;
-const ACTIONS = { KeyN: "next", KeyP: "previous", KeyR: "reset", KeyF: "toggle-fly", KeyB: "background", KeyK: "key" };
+const ACTIONS = { KeyN: "next", KeyP: "previous", KeyR: "reset", KeyF: "toggle-fly", KeyB: "background", KeyK: "key", KeyC: "cameras", KeyM: "measure" };
 const HELD = new Set(["KeyW", "KeyA", "KeyS", "KeyD", "KeyQ", "KeyE", "ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", "Equal", "Minus", "NumpadAdd", "NumpadSubtract"]);
 
 /** Moves a camera by keys, and turns it on the spot by dragging while it flies. */

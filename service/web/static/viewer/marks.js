@@ -1,0 +1,110 @@
+// Points that are clicked in the 3D view: a distance between two of them, and notes that are kept with the job.
+
+import { Vector3 } from "../vendor/three.js";
+
+const CLICK_PX = 5;
+
+export class Marks {
+    /** @param viewer has the box, canvas, camera, controls, overlay, pick(x, y), wake(), goTo(position, target). */
+    constructor(viewer) {
+        this.viewer = viewer;
+        this.mode = null; // "measure" or "note"
+        const { box, canvas } = viewer;
+        this.form = box.querySelector(".note-form");
+        this.list = box.querySelector(".view-notes");
+        this.notes = JSON.parse(box.dataset.notes || "[]");
+        let down = null;
+        canvas.addEventListener("pointerdown", (event) => { down = [event.offsetX, event.offsetY]; });
+        canvas.addEventListener("pointerup", (event) => {
+            const isClick = down && Math.hypot(event.offsetX - down[0], event.offsetY - down[1]) < CLICK_PX;
+            if (this.mode && isClick && event.button === 0) this.take(event.offsetX, event.offsetY);
+        });
+        canvas.addEventListener("keydown", (event) => {
+            if (this.mode && event.key === "Enter") this.take(canvas.clientWidth / 2, canvas.clientHeight / 2);
+            if (this.mode && event.key === "Escape") this.toggle(this.mode);
+        });
+        this.form.addEventListener("submit", (event) => {
+            event.preventDefault();
+            this.keep();
+        });
+        this.form.querySelector("[data-do=note-cancel]").addEventListener("click", () => { this.form.hidden = true; });
+        this.showNotes();
+    }
+
+    toggle(mode) {
+        this.mode = this.mode === mode ? null : mode;
+        const { box, overlay, canvas, place } = this.viewer;
+        for (const name of ["measure", "note"]) box.querySelector(`[data-do=${name}]`)?.setAttribute("aria-pressed", String(this.mode === name));
+        canvas.classList.toggle("picking", this.mode !== null);
+        overlay.segment = [];
+        place.textContent = this.mode === "measure" ? "Click two points." : this.mode === "note" ? "Click a point." : "";
+        this.form.hidden = true;
+        this.viewer.wake();
+    }
+
+    async take(x, y) {
+        const { overlay, place, box } = this.viewer;
+        const mode = this.mode, point = await this.viewer.pick(x, y);
+        if (!point) {
+            place.textContent = "Nothing is there.";
+            return;
+        }
+        if (mode === "note") {
+            this.point = point;
+            this.form.hidden = false;
+            this.form.querySelector("input").focus();
+            return;
+        }
+        if (overlay.segment.length === 2) overlay.segment = [];
+        overlay.segment.push(point);
+        if (overlay.segment.length === 2) {
+            const distance = Math.hypot(...point.map((value, k) => value - overlay.segment[0][k]));
+            overlay.label = distance.toPrecision(4);
+            place.textContent = `Distance ${overlay.label} in the scene's units`;
+            box.dataset.distance = String(distance);
+        } else place.textContent = "Click the second point.";
+        this.viewer.wake();
+    }
+
+    async keep() {
+        const { camera, controls } = this.viewer;
+        const input = this.form.querySelector("input");
+        const note = { text: input.value.trim(), position: this.point, camera: [...camera.position.toArray(), ...controls.target.toArray()] };
+        if (await this.store([...this.notes, note])) {
+            input.value = "";
+            this.form.hidden = true;
+            this.toggle("note");
+        }
+    }
+
+    async store(notes) {
+        const { box, place } = this.viewer;
+        const response = await fetch(`/v1/jobs/${box.dataset.job}`, {
+            method: "PATCH", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ view_notes: notes }),
+        }).catch(() => null);
+        if (response?.ok) this.notes = notes;
+        else place.textContent = (await response?.json().catch(() => null))?.detail ?? "The note was not kept.";
+        this.showNotes();
+        return Boolean(response?.ok);
+    }
+
+    showNotes() {
+        const mayChange = this.viewer.box.querySelector("[data-do=note]") !== null;
+        this.viewer.overlay.notes = this.notes;
+        this.list.hidden = !this.notes.length;
+        this.list.replaceChildren(...this.notes.map((note, k) => {
+            const item = document.createElement("li");
+            const go = Object.assign(document.createElement("button"), { type: "button", className: "plain", textContent: note.text, title: "Look at it" });
+            go.addEventListener("click", () => this.viewer.goTo(note.camera.slice(0, 3), new Vector3().fromArray(note.camera, 3)));
+            item.append(go);
+            if (mayChange) {
+                const remove = Object.assign(document.createElement("button"), { type: "button", className: "plain", textContent: "×" });
+                remove.setAttribute("aria-label", `Remove the note ${note.text}`);
+                remove.addEventListener("click", () => this.store(this.notes.filter((_note, other) => other !== k)));
+                item.append(" ", remove);
+            }
+            return item;
+        }));
+        this.viewer.wake();
+    }
+}
