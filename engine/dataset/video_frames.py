@@ -1,6 +1,7 @@
 """Photographs from a video: the sharpest frame of each stretch, read by ffmpeg."""
 
 import json
+import math
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
@@ -15,6 +16,7 @@ from PIL import Image
 from octasplat.engine.core.errors import DatasetError, OutputError
 from octasplat.engine.core.scene_layout import VIDEO_SUFFIXES
 from octasplat.engine.core.writing import write_json
+from octasplat.engine.dataset.image_sizes import ImageSizes
 
 RECORD_FILE = "frames.json"
 """Says of which video the frames are; beside the folder of the frames."""
@@ -76,9 +78,25 @@ def write_frames(video: Path, folder: Path, frames_per_second: float, on_step: O
     return count
 
 
+def planned_frames(video: Path, frames_per_second: float) -> ImageSizes:
+    """Return the size and number of the photographs that :func:`write_frames` would write.
+
+    Raises:
+        DatasetError: the video cannot be read.
+    """
+    count = max(1, math.ceil(_duration_seconds(video) * frames_per_second - 1e-6))
+    with _open_frames(video, frames_per_second, most=1) as frames:
+        shapes = [frame.shape for frame in frames]
+    if not shapes:
+        raise _unreadable(video, "it has no pictures")
+    return ImageSizes(shapes[0][1], shapes[0][0], count)
+
+
 @contextmanager
-def _open_frames(video: Path, rate: float) -> Iterator[Iterator[UInt8[np.ndarray, "height width 3"]]]:
-    """Yield the frames of a video at an even rate, turned as they are shown, one by one.
+def _open_frames(
+    video: Path, rate: float, most: int | None = None
+) -> Iterator[Iterator[UInt8[np.ndarray, "height width 3"]]]:
+    """Yield the frames of a video at an even rate, turned as they are shown, one by one; the first ``most``.
 
     Raises:
         DatasetError: ffmpeg cannot read the file.
@@ -87,7 +105,8 @@ def _open_frames(video: Path, rate: float) -> Iterator[Iterator[UInt8[np.ndarray
 
     command = [
         imageio_ffmpeg.get_ffmpeg_exe(), "-nostdin", "-loglevel", "error", "-i", str(video), "-an", "-sn",
-        "-vf", f"fps={rate:g}", "-f", "image2pipe", "-c:v", "ppm", "-",
+        "-vf", f"fps={rate:g}", *(() if most is None else ("-frames:v", str(most))),
+        "-f", "image2pipe", "-c:v", "ppm", "-",
     ]  # fmt: skip
     with (
         tempfile.TemporaryFile() as said,

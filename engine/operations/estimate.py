@@ -34,7 +34,10 @@ class EstimateRequest(EstimateOptions, Request):
     """
 
     source: Annotated[Path, Positional("SCENE"), ReadPath()] = Field(
-        description="The folder of the photographs."
+        description="The folder of the photographs, or a video, of which no frames are written."
+    )
+    frames_per_second: Annotated[float, Spelling(metavar="N")] = Field(
+        2.0, gt=0, le=120, description="Of a video: so many frames of each second would be taken."
     )
 
 
@@ -85,13 +88,19 @@ def run(
         DatasetError: there are no photographs, or one cannot be read.
         ConfigError: a setting cannot be used.
     """
+    from octasplat.engine.dataset.video_frames import is_video, planned_frames
     from octasplat.engine.poses.photographs import locate_scene, notes_on_files
 
+    config, cores = request.config(), request.cores or threads
+    if is_video(request.source):
+        frames = planned_frames(request.source, request.frames_per_second)
+        estimate = estimate_photographs([frames], config.with_poses_decided(False), cores)
+        return EstimateResult(photographs=(frames,), **estimate.model_dump())
     scene = locate_scene(request.source)
     for sentence in notes_on_files(scene):
         progress(Warned(sentence))
     sizes = photograph_sizes(scene)
-    found = estimate_scene(scene, request.config(), sizes, request.cores or threads)
+    found = estimate_scene(scene, config, sizes, cores)
     return EstimateResult(photographs=tuple(sizes), **found.model_dump())
 
 
@@ -107,11 +116,18 @@ def estimate_scene(
         cores: to reckon with; 0 takes those of this machine.
     """
     from octasplat.engine.dataset.model_sources import has_model
+
+    return estimate_photographs(sizes, config.with_poses_decided(has_model(scene)), cores)
+
+
+def estimate_photographs(
+    sizes: Sequence[ImageSizes], config: "ReconstructionConfig", cores: int = 0
+) -> "Estimate":
+    """Return the estimate for photographs of these sizes, where it is decided whether poses are found."""
     from octasplat.engine.operations.cost_model import estimate_reconstruction
     from octasplat.engine.operations.precompile import cold_start_seconds
 
-    decided = config.with_poses_decided(has_model(scene))
-    found = estimate_reconstruction(decided, sizes, cores or available_threads())
+    found = estimate_reconstruction(config, sizes, cores or available_threads())
     return found.with_cold_start(cold_start_seconds(["reconstruct"]))
 
 

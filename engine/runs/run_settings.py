@@ -9,7 +9,7 @@ from octasplat.engine.runs.export_names import ExportNames
 from octasplat.engine.runs.result_files import DEFAULT_EXPORTS
 from octasplat.engine.settings import renamed_settings
 from octasplat.engine.settings.fields import ADVANCED, BASIC, Spelling, Unit
-from octasplat.engine.settings.preset_names import PresetName
+from octasplat.engine.settings.preset_names import PRESET_WORDS, PresetName
 
 
 class RunSettings(BaseModel):
@@ -21,9 +21,9 @@ class RunSettings(BaseModel):
 
     preset: Annotated[PresetName, BASIC] = Field(
         "standard",
-        description="Where the settings of the training come from: fast is a first look, standard is "
-        "better, high is better yet and takes about three times as many iterations, redisplats has "
-        "the published settings.",
+        description="Where the settings of the training come from. "
+        + "; ".join(f"{name}: {words.text.replace(';', ',')}" for name, words in PRESET_WORDS.items())
+        + ".",
     )
     max_side: Annotated[int | None, Unit("px"), BASIC] = Field(
         None,

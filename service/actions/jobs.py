@@ -28,6 +28,7 @@ from octasplat.workers.db.connections import Connection, retry_on_deadlock
 from octasplat.workers.db.holds import read_holds
 from octasplat.workers.db.rows import Job, JobState
 from octasplat.workers.queue import jobs as rows
+from octasplat.workers.queue.jobs import JobOrder
 from octasplat.workers.worker.job_kinds import get_job_kind
 from octasplat.workers.worker.job_kinds.stored_options import expected_options
 from octasplat.workers.worker.path_redaction import shorten_absolute_paths
@@ -45,6 +46,7 @@ class JobFilter:
         kind: its kind.
         label: its label.
         dataset_id: what it works on.
+        order: which come first.
         text: part of its label, its kind, the name of its dataset, or the end of its id.
     """
 
@@ -53,6 +55,7 @@ class JobFilter:
     label: str | None = None
     dataset_id: uuid.UUID | None = None
     text: str | None = None
+    order: JobOrder = "newest"
 
 
 @dataclass(frozen=True)
@@ -66,13 +69,13 @@ class JobWithView:
 async def list_jobs(
     service: Service, principal: Principal, job_filter: JobFilter, *, before: uuid.UUID | None, limit: int
 ) -> Page[Job]:
-    """Return jobs that the principal may see, newest first.
+    """Return jobs that the principal may see, in the order of the filter.
 
     Args:
         service: the service.
         principal: asks.
         job_filter: which of them.
-        before: made before this one.
+        before: that come behind this one.
         limit: at most so many.
     """
     async with service.pool.connection() as connection:
@@ -85,6 +88,7 @@ async def list_jobs(
             dataset_id=job_filter.dataset_id,
             text=_without_nul(job_filter.text),
             before=before,
+            order=job_filter.order,
             limit=limit + 1,
         )
     return page_of(found, limit, lambda job: job.id)

@@ -27,6 +27,7 @@ from octasplat.service.routes.response_headers import (
 from octasplat.service.schemas.jobs import JobChange, JobPage, JobSummary, JobView, NewJob, RetryRequest
 from octasplat.service.state import ServiceDep
 from octasplat.workers.db.rows import JobState
+from octasplat.workers.queue.jobs import JobOrder
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
@@ -57,11 +58,15 @@ async def list_jobs(
     kind: Annotated[str | None, Query(max_length=40, description="Jobs of this kind.")] = None,
     label: Annotated[str | None, Query(max_length=200, description="Jobs of this label.")] = None,
     dataset_id: Annotated[uuid.UUID | None, Query(description="Jobs on this dataset.")] = None,
+    order: Annotated[
+        JobOrder,
+        Query(description="Newest first, oldest first, by name, best PSNR first, longest work first."),
+    ] = "newest",
     limit: Limit = 50,
     cursor: Cursor = None,
 ) -> JobPage:  # fmt: skip
-    """List your jobs, newest first; their options are at the address of each."""
-    job_filter = JobFilter(state or (), kind, label, dataset_id)
+    """List your jobs, newest first unless asked otherwise; their options are at the address of each."""
+    job_filter = JobFilter(state or (), kind, label, dataset_id, order=order)
     part = await actions.list_jobs(
         service, principal, job_filter, before=decode_id_cursor(cursor), limit=limit
     )
@@ -94,7 +99,7 @@ async def change_job(
     job_id: JobId, change: JobChange, principal: Writer, service: ServiceDep, response: Response,
     if_match: IfMatch = None,
 ) -> JobView:  # fmt: skip
-    """Rename a job, or pin it so that it does not expire."""
+    """Rename a job, pin it so that it does not expire, or replace the notes in its 3D view."""
 
     def check(job: JobWithView) -> None:
         check_precondition(if_match, _job_etag(job))

@@ -5,13 +5,14 @@ from fastapi import FastAPI
 
 def mount_pages(app: FastAPI) -> None:
     """Add the pages and their static files to the application."""
-    from octasplat.service.web import api_page, overview_pages, pages, session
+    from octasplat.service.web import api_page, job_list, overview_pages, pages, session
     from octasplat.service.web.assets import StaticAssets
     from octasplat.service.web.documentation import DocumentationSite
     from octasplat.service.web.routing import UnknownPage
 
     app.include_router(session.router)
     app.include_router(overview_pages.router)
+    app.include_router(job_list.router)
     app.include_router(pages.router)
     app.include_router(api_page.router)
     app.mount("/static", StaticAssets(), name="static")

@@ -3,12 +3,13 @@
 import json
 import urllib.parse
 import uuid
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-from fastapi import APIRouter, Depends, Query, Request, Response
+from fastapi import APIRouter, Request, Response
 from fastapi.responses import HTMLResponse, JSONResponse
 
 from octasplat.engine.operations.clean import CleanOptions
+from octasplat.engine.settings.preset_names import PRESET_WORDS
 from octasplat.service.actions import jobs as actions
 from octasplat.service.actions.artifacts import find_live_scene, get_artifact, list_artifacts
 from octasplat.service.actions.datasets import list_datasets
@@ -17,11 +18,11 @@ from octasplat.service.actions.system import list_live_workers
 from octasplat.service.auth import Principal, Reader, Writer
 from octasplat.service.downloads import send_blob
 from octasplat.service.job_limits import limits_by_path
-from octasplat.service.paging import decode_id_cursor, encode_cursor
 from octasplat.service.queue_workers import unwritable_formats
 from octasplat.service.schemas.jobs import JobChange, RetryRequest
 from octasplat.service.state import Service, ServiceDep
 from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
+from octasplat.service.web.formatting import format_thousands
 from octasplat.service.web.forms import KINDS_WITH_OWN_FORM, options_form
 from octasplat.service.web.job_cameras import viewer_cameras_of_job
 from octasplat.service.web.relight_form import relight_form
@@ -42,61 +43,22 @@ from octasplat.service.web.results import (
 from octasplat.service.web.routing import PageRoute, is_htmx_request, redirect
 from octasplat.service.web.stage_form import stage_form
 from octasplat.service.web.templating import render_page
-from octasplat.service.web.view_models import ACTIVE, job_counts, job_detail, list_job_rows, photographs_of
+from octasplat.service.web.view_models import ACTIVE, job_detail, photographs_of
+from octasplat.workers.db.live_scenes import LiveScene
 from octasplat.workers.db.rows import Artifact
 from octasplat.workers.worker.job_kinds import get_job_kind, job_kinds
 
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 
-PAGE_SIZE = 30
 MAX_DATASETS = 50
 MAX_PICTURES = 24
-StateFilter = Literal["all", "active", "done", "failed"]
-Cursor = Annotated[str | None, Query(max_length=200)]
-Search = Annotated[str | None, Query(alias="q", max_length=100)]
-
+MAX_LABEL = 200
+_MAX_LABEL_FORM_BYTES = 4096
 # The report brings its script along: it runs, but as nobody, and can reach nothing.
 _REPORT_POLICY = (
     "sandbox allow-scripts; default-src 'none'; img-src data:; style-src 'unsafe-inline'; "
     "script-src 'unsafe-inline'; form-action 'none'; base-uri 'none'; frame-ancestors 'none'"
 )
-
-
-async def _job_list_context(
-    principal: Reader,
-    service: ServiceDep,
-    show: StateFilter = "all",
-    text: Search = None,
-    cursor: Cursor = None,
-) -> dict[str, Any]:
-    """Return what the list of jobs shows."""
-    text = (text or "").strip()
-    before = decode_id_cursor(cursor)
-    part = await list_job_rows(service, principal, show, before, PAGE_SIZE, text=text or None)
-    return {
-        "lines": part.rows,
-        "next": None if part.next_key is None else encode_cursor(part.next_key),
-        "counts": await job_counts(service, principal),
-        "show": show,
-        "cursor": cursor,
-        "search": text,
-        "query": urllib.parse.urlencode({"show": show, **({"q": text} if text else {})}),
-    }
-
-
-JobListContext = Annotated[dict[str, Any], Depends(_job_list_context)]
-
-
-@router.get("/")
-async def show_jobs(request: Request, principal: Reader, context: JobListContext) -> Response:
-    """Return the page with the list of jobs."""
-    return render_page(request, "jobs.html", principal, **context)
-
-
-@router.get("/parts/jobs")
-async def show_job_list(request: Request, principal: Reader, context: JobListContext) -> Response:
-    """Return the list of jobs without its page."""
-    return render_page(request, "_jobs.html", principal, **context)
 
 
 @router.get("/jobs/{job_id}")
@@ -140,6 +102,7 @@ async def show_job(request: Request, job_id: uuid.UUID, principal: Reader, servi
         groups=download_groups(artifacts),
         scene=by_name.get(SCENE),
         live=live,
+        live_count=_live_count(live) if SCENE not in by_name else "",
         view_notes=[note.model_dump() for note in detail.line.job.view_notes],
         shows_live=detail.line.job.kind == "reconstruct"
         and detail.line.job.state != "succeeded"
@@ -212,6 +175,7 @@ async def show_new(
         "new.html",
         principal,
         form=options_form(kind, unwritable_formats(workers), limits_by_path(kind, service.settings)),
+        presets=PRESET_WORDS,
         from_files=[options_form(other) for other in job_kinds() if other.needs == "files"],
         datasets=[row for row in datasets.rows if row.state == "committed" and row.holds == "photographs"],
         chosen=dataset or (earlier.dataset_id if earlier else None),
@@ -245,6 +209,15 @@ async def pin(
     """Pin a job so that it does not expire, or unpin it."""
     await actions.change_job(service, principal, job_id, JobChange(pinned=keep))
     return await _updated_page(request, job_id, principal, service)
+
+
+@router.post("/jobs/{job_id}/label")
+async def rename(request: Request, job_id: uuid.UUID, principal: Writer, service: ServiceDep) -> Response:
+    """Give a job another name, or with an empty one that of its dataset, and return to it."""
+    body = (await request.body())[:_MAX_LABEL_FORM_BYTES].decode(errors="replace")
+    label = urllib.parse.parse_qs(body).get("label", [""])[0].strip()
+    await actions.change_job(service, principal, job_id, JobChange(label=label[:MAX_LABEL] or None))
+    return redirect(request, f"/jobs/{job_id}")
 
 
 @router.post("/jobs/{job_id}/delete")
@@ -289,6 +262,16 @@ def _up_world(config: dict[str, object]) -> str:
 def _evaluation_background(config: dict[str, object]) -> object:
     found = _config_value(config, "reconstruction", "evaluation_background")
     return found or _config_value(config, "reconstruction", "evaluate_background") or "black"
+
+
+def _live_count(live: LiveScene | None) -> str:
+    """Return what the viewer says of the state that it shows; job.js says the same of later ones."""
+    if live is None:
+        return ""
+    number = format_thousands(live.gaussians)
+    return (
+        f"Step {format_thousands(live.step)}, {number} Gaussians" if live.step else f"{number} sparse points"
+    )
 
 
 def _edit_values(views: dict[str, Any]) -> dict[str, object]:

@@ -20,6 +20,7 @@ from octasplat.workers.db.connections import Connection, select_columns
 from octasplat.workers.db.datasets import files_of, get_dataset
 from octasplat.workers.db.rows import Artifact, Dataset, DatasetFile, Job, JobEvent, JobState
 from octasplat.workers.queue import jobs as rows
+from octasplat.workers.queue.jobs import JobOrder
 
 ACTIVE: tuple[JobState, ...] = ("queued", "running", "canceling")
 STATE_FILTERS: dict[str, tuple[JobState, ...]] = {
@@ -78,9 +79,11 @@ async def list_job_rows(
     limit: int,
     *,
     text: str | None = None,
+    kind: str | None = None,
+    order: JobOrder = "newest",
 ) -> Page[JobRow]:
-    """Return the newest jobs of one kind of state, those with ``text`` in their names, kinds or ids."""
-    job_filter = JobFilter(STATE_FILTERS[state_filter], text=text)
+    """Return jobs of one kind of state in an order, those with ``text`` in their names, kinds or ids."""
+    job_filter = JobFilter(STATE_FILTERS[state_filter], kind=kind, text=text, order=order)
     part = await list_jobs(service, principal, job_filter, before=before, limit=limit)
     async with service.pool.connection() as connection:
         return Page(await _job_rows(service, connection, part.rows), part.next_key)

@@ -110,9 +110,12 @@ def reconstruct(
     Args:
         source: The folder of the photographs, or a video.
         output: Folder for the results.
-        preset: Where the settings of the training come from: fast is a first look, standard is better,
-            high is better yet and takes about three times as many iterations, redisplats has the
-            published settings. Default: standard.
+        preset: Where the settings of the training come from. fast: a first look, four to ten times
+            faster than standard and less sharp; standard: the usual choice, sharp enough for most uses;
+            high: for a final result: a little sharper than standard, in three to four times its time
+            and with more Gaussians, where photographs are many and sharp; redisplats: the settings that
+            the paper REdiSplats published, to compare with it, for a scene of your own, standard is
+            better. Default: standard.
         max_side: Longest side to which photographs are shrunk; by default they keep their size. Set it
             for a quick try, or where memory is short.
         test_every: Every N-th view by name is held out to be measured; 0 holds out none, so that all
@@ -235,6 +238,7 @@ def estimate(
     train: Mapping[str, Any] | None = None,
     assignments: Sequence[str] | None = None,
     cores: int | None = None,
+    frames_per_second: float | None = None,
     progress: EventListener | None = None,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
@@ -242,10 +246,13 @@ def estimate(
     """Estimate what a reconstruction takes, before it is begun.
 
     Args:
-        source: The folder of the photographs.
-        preset: Where the settings of the training come from: fast is a first look, standard is better,
-            high is better yet and takes about three times as many iterations, redisplats has the
-            published settings. Default: standard.
+        source: The folder of the photographs, or a video, of which no frames are written.
+        preset: Where the settings of the training come from. fast: a first look, four to ten times
+            faster than standard and less sharp; standard: the usual choice, sharp enough for most uses;
+            high: for a final result: a little sharper than standard, in three to four times its time
+            and with more Gaussians, where photographs are many and sharp; redisplats: the settings that
+            the paper REdiSplats published, to compare with it, for a scene of your own, standard is
+            better. Default: standard.
         max_side: Longest side to which photographs are shrunk; by default they keep their size. Set it
             for a quick try, or where memory is short.
         test_every: Every N-th view by name is held out to be measured; 0 holds out none, so that all
@@ -283,6 +290,7 @@ def estimate(
         assignments: Any other setting, e.g. lr.quat=0.02 or test_every=4, values as JSON; octasplat
             config list shows them.
         cores: Cores of the machine to reckon with; 0 takes those of this one. Default: 0.
+        frames_per_second: Of a video: so many frames of each second would be taken. Default: 2.0.
         progress: told each event; by default they are logged, or shown in a notebook.
         should_stop: asked now and then; True ends the work with ``CancelledError``.
         threads: number of threads; 0 takes all cores. The result does not depend on it.
@@ -321,6 +329,7 @@ def estimate(
             "assignments": assignments,
             "cores": cores,
             "source": source,
+            "frames_per_second": frames_per_second,
         },
         progress,
         should_stop,
@@ -1443,6 +1452,7 @@ def clean(
     link: float | None = None,
     neighbors: int | None = None,
     camera_clearance: float | None = None,
+    min_views: int | None = None,
     dry_run: bool = False,
     progress: EventListener | None = None,
     should_stop: Callable[[], bool] = never_stop,
@@ -1467,6 +1477,8 @@ def clean(
         neighbors: How many nearest neighbours of a Gaussian may belong to its group. Default: 12.
         camera_clearance: In a run: remove those nearer to the camera of a training view than this share
             of the distance at which the sparse points around it begin; 0 for none. Default: 0.25.
+        min_views: In a run: remove those whose centre lies in the image of fewer training views than
+            this, which lie beyond what the cameras see; 0 for none. Default: 0.
         dry_run: Only count.
         progress: told each event; by default they are logged, or shown in a notebook.
         should_stop: asked now and then; True ends the work with ``CancelledError``.
@@ -1493,6 +1505,7 @@ def clean(
             "link": link,
             "neighbors": neighbors,
             "camera_clearance": camera_clearance,
+            "min_views": min_views,
             "output": output,
             "dry_run": dry_run,
         },

@@ -1,5 +1,6 @@
 """Photographs from videos: the sharpest frame of each stretch."""
 
+import json
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -9,7 +10,7 @@ from PIL import Image
 
 from octasplat.engine.core.errors import DatasetError, OutputError
 from octasplat.engine.core.events import Noted
-from octasplat.engine.dataset.video_frames import is_video, sharpness, write_frames
+from octasplat.engine.dataset.video_frames import is_video, planned_frames, sharpness, write_frames
 from octasplat.engine.operations.reconstruct import ReconstructRequest, run, scene_folder
 
 FPS, SECONDS = 10, 3
@@ -83,6 +84,17 @@ def test_reconstruction_takes_the_frames_beside_its_output(clip: Path, tmp_path:
         run(request, progress=lambda event: notes.append(event.message) if isinstance(event, Noted) else None)
     assert f"3 frames of clip.mp4 are in {tmp_path / 'run-frames'}." in notes
     assert len(list((tmp_path / "run-frames" / "images").iterdir())) == 3
+
+
+def test_estimate_counts_the_frames_that_would_be_taken(octasplat, clip: Path) -> None:
+    asked = octasplat("estimate", clip, "--frames-per-second", "2", "--preset", "fast", "--json")
+    assert asked.exit_code == 0, asked.stderr
+    found = json.loads(asked.stdout)
+    assert found["photographs"] == [{"width_px": 96, "height_px": 64, "count": 2 * SECONDS}]
+    assert found["finds_poses"] and found["seconds"] > found["poses_seconds"] > 0
+    assert not list(clip.parent.glob("*-frames")) and planned_frames(clip, 0.4).count == 2
+    plain = octasplat("estimate", clip)
+    assert plain.stdout.startswith("6 photographs: about ")
 
 
 def test_videos_are_not_sent(octasplat, clip: Path, monkeypatch: pytest.MonkeyPatch) -> None:

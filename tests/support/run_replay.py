@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from octasplat.workers.db.connections import open_pool
+from octasplat.workers.db.events_and_logs import add_event
+from octasplat.workers.db.live_scenes import LiveScene, put_live_scene
 from octasplat.workers.queue.attempts import Attempt, ResultFile, claim
 from octasplat.workers.queue.jobs import get_job
 from octasplat.workers.reporting.events import encode_training_progress
@@ -50,6 +52,20 @@ class RunReplay:
             error: end as failed with this.
         """
         asyncio.run(self._run(job_id, run, until, preview, error))
+
+    def show_live(self, job_id: uuid.UUID, scene: Path, views: Path, *, step: int, gaussians: int) -> None:
+        """Tell of a state of the training of a job that was left running."""
+        row = LiveScene(job_id, self.store(scene), self.store(views), step, gaussians)
+        asyncio.run(self._show_live(row))
+
+    async def _show_live(self, row: LiveScene) -> None:
+        async with (
+            open_pool(self._conninfo, max_size=1, wait_seconds=10) as pool,
+            pool.connection() as connection,
+        ):
+            await put_live_scene(connection, row)
+            told = {"step": row.step, "gaussians": row.gaussians}
+            await add_event(connection, row.job_id, 1, "live_scene", told)
 
     async def _run(
         self, job_id: uuid.UUID, run: Path, until: int | None, preview: Mapping[str, Any] | None,

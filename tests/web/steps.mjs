@@ -60,7 +60,7 @@ const nameless = (page) => page.evaluate(() => [...document.querySelectorAll("a,
 
 /** Mean and spread of the brightness of what the viewer shows. */
 async function brightness(page) {
-    const clip = await page.locator("#viewer canvas").boundingBox();
+    const clip = await page.locator("#viewer canvas:not(.overlay)").boundingBox();
     const png = (await page.screenshot({ clip })).toString("base64");
     return page.evaluate(async (data) => {
         const bytes = Uint8Array.from(atob(data), (letter) => letter.charCodeAt(0));
@@ -72,6 +72,33 @@ async function brightness(page) {
         for (let k = 0; k < pixels.length; k += 4) { const v = (pixels[k] + pixels[k + 1] + pixels[k + 2]) / 3; sum += v; squares += v * v; count += 1; }
         return { mean: sum / count, deviation: Math.sqrt(squares / count - (sum / count) ** 2) };
     }, png);
+}
+
+/** What axe finds of serious or critical faults. */
+async function faults(page) {
+    if (!job.axe) return [];
+    await page.evaluate(readFileSync(join(job.axe, "axe.min.js"), "utf8"));
+    const { violations } = await page.evaluate(() => axe.run(document, { resultTypes: ["violations"] }));
+    return violations.filter(({ impact }) => ["serious", "critical"].includes(impact)).map(({ id, nodes }) => `${id}: ${nodes.slice(0, 3).map((node) => node.html.slice(0, 160)).join(" | ")}`);
+}
+
+/** Pictures of a page at both widths, light and dark, and what axe says of them. */
+async function portray(path, name, prepare = async () => {}) {
+    const found = [];
+    for (const width of [1280, 390]) {
+        for (const colorScheme of ["light", "dark"]) {
+            const page = await open({ width, height: 860, colorScheme });
+            await page.goto(`${job.url}${path}`);
+            await prepare(page);
+            await shot(page, `${name}_${width}_${colorScheme}`);
+            found.push(...(await faults(page)).map((fault) => `${width} ${colorScheme} ${fault}`));
+            const wide = await overflow(page);
+            if (wide > 0) found.push(`${width} ${colorScheme} is ${wide} px too wide`);
+            if (width === 1280) found.push(...await nameless(page));
+            await page.context().close();
+        }
+    }
+    return found;
 }
 
 const steps = {
@@ -115,7 +142,7 @@ const steps = {
         await page.goto(`${job.url}/new`);
         await shot(page, "new");
         await page.setInputFiles("#pick-folder", job.folder);
-        await page.selectOption("[data-path=preset]", "fast");
+        await page.check("[data-path=preset] [value=fast]");
         found.iterationsHint = await page.getAttribute("[data-path='train.iterations']", "placeholder");
         await page.fill("#label", "a still life");
         await page.click("details.all summary");
@@ -219,6 +246,119 @@ const steps = {
         return found;
     },
 
+    /** A training is watched in 3D: sparse points, then a state, its cameras, a held-out view and its photograph. */
+    async live() {
+        const found = {};
+        const page = await open();
+        await page.goto(`${job.url}/jobs/${job.job}`);
+        found.before = await page.textContent("#viewer .veil-text");
+        const counted = (words) => page.waitForFunction((words) => document.querySelector("#viewer .count")?.textContent.includes(words), words);
+        await counted("sparse points");
+        await page.waitForSelector("#viewer[data-ready=yes]");
+        await shot(page, "live_points");
+        await counted("Step 30");
+        await page.waitForSelector("#viewer[data-rested=yes]");
+        found.count = await page.textContent("#viewer .count");
+        found.views = await page.locator("#viewer .views option").allTextContents();
+        found.unplaced = [await page.textContent("#viewer .unplaced summary"), ...await page.locator("#viewer .unplaced li").evaluateAll((items) => items.map((item) => item.textContent))];
+        const marks = () => page.evaluate(() => { const canvas = document.querySelector("#viewer .overlay"); return canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data.filter((value, k) => k % 4 === 3 && value > 0).length; });
+        found.marks = [await marks()];
+        await page.click("#viewer [data-do=cameras]");
+        await page.waitForTimeout(300);
+        found.marks.push(await marks());
+        const held = found.views.findIndex((name) => name.endsWith("(held out)"));
+        await page.selectOption("#viewer .views", String(held - 1));
+        found.place = await page.textContent("#viewer .place");
+        await page.selectOption("#viewer .photo-mode", "over");
+        found.photograph = await page.evaluate(async () => {
+            const image = document.querySelector("#viewer .photo");
+            await image.decode();
+            const box = image.getBoundingClientRect(), screen = image.parentElement.getBoundingClientRect();
+            return { alt: image.alt, width: image.naturalWidth, ratio: box.width / box.height, covers: box.height / screen.height };
+        });
+        await page.waitForTimeout(500);
+        await shot(page, "live_photograph");
+        await page.focus("#viewer canvas:not(.overlay)");
+        await page.keyboard.press("ArrowLeft");
+        await page.waitForFunction(() => document.querySelector("#viewer .photo").hidden);
+        await page.selectOption("#viewer .photo-mode", "corner");
+        found.corner = await page.isVisible("#viewer .photo");
+        await shot(page, "live_cameras");
+        found.faults = await portray(`/jobs/${job.job}`, "live", (other) => other.waitForSelector("#viewer[data-rested=yes]"));
+        return found;
+    },
+
+    /** On a result: a distance, a note that stays, a link to a view, and a crop that is seen and then asked for. */
+    async edit() {
+        const found = {};
+        const page = await open();
+        await page.goto(`${job.url}/jobs/${job.job}`);
+        const ready = () => page.waitForSelector("#viewer[data-rested=yes]");
+        await ready();
+        const at = async (x, y) => {
+            const { width, height } = await page.locator("#viewer canvas:not(.overlay)").boundingBox();
+            await page.locator("#viewer canvas:not(.overlay)").click({ position: { x: x * width, y: y * height } });
+        };
+        await page.click("#viewer [data-do=measure]");
+        await at(0.45, 0.5);
+        await page.waitForFunction(() => /second/.test(document.querySelector("#viewer .place").textContent));
+        await at(0.55, 0.5);
+        await page.waitForSelector("#viewer[data-distance]");
+        found.distance = [Number(await page.getAttribute("#viewer", "data-distance")), await page.textContent("#viewer .place")];
+        await shot(page, "measure", false);
+        await page.click("#viewer [data-do=note]");
+        await page.focus("#viewer canvas:not(.overlay)");
+        await page.keyboard.press("Enter");
+        await page.waitForSelector("#viewer .note-form:not([hidden])");
+        await page.fill("#note-text", "the middle <b>");
+        await page.keyboard.press("Enter");
+        await page.waitForSelector("#viewer .view-notes li");
+        await page.focus("#viewer canvas:not(.overlay)");
+        for (const key of ["ArrowLeft", "ArrowUp"]) await page.keyboard.press(key);
+        await page.waitForTimeout(200);
+        await ready();
+        await page.click("#viewer [data-do=link]");
+        await page.waitForFunction(() => location.hash);
+        const hash = await page.evaluate(() => location.hash);
+        await page.goto("about:blank");
+        await page.goto(`${job.url}/jobs/${job.job}${hash}`);
+        await ready();
+        await page.click("#viewer [data-do=link]");
+        await page.waitForTimeout(100);
+        found.links = [hash, await page.evaluate(() => location.hash)];
+        found.notes = await page.locator("#viewer .view-notes li button:first-child").allTextContents();
+        await page.click("#edit > summary");
+        await page.check("#edit [name=clean]");
+        await page.waitForFunction(() => document.getElementById("viewer").dataset.edited?.includes("faint"));
+        found.cleaned = JSON.parse(await page.getAttribute("#viewer", "data-edited"));
+        await page.uncheck("#edit [name=clean]");
+        await page.check("#edit [name=crop]");
+        await page.locator("#edit [name=x_low]").focus();
+        for (let k = 0; k < 40; k++) await page.keyboard.press("ArrowRight");
+        await page.waitForFunction(() => (JSON.parse(document.getElementById("viewer").dataset.edited).outside ?? 0) > 0);
+        await page.waitForTimeout(700);
+        found.cropped = JSON.parse(await page.getAttribute("#viewer", "data-edited"));
+        found.said = await page.textContent("#edit .edit-state");
+        await ready();
+        const shown = await brightness(page);
+        await shot(page, "crop");
+        await page.click("#edit [data-show=removed]");
+        await page.waitForTimeout(400);
+        await ready();
+        found.differs = Math.abs((await brightness(page)).mean - shown.mean);
+        found.faults = await portray(`/jobs/${job.job}`, "edit", async (other) => {
+            await other.waitForSelector("#viewer[data-rested=yes]");
+            await other.click("#edit > summary");
+            await other.check("#edit [name=crop]");
+            await other.check("#edit [name=clean]");
+            await other.waitForTimeout(800);
+        });
+        await page.click("#edit [value=crop]");
+        await page.waitForURL((url) => !url.pathname.endsWith(job.job) && url.pathname.startsWith("/jobs/"));
+        found.job = page.url().split("/").pop();
+        return found;
+    },
+
     /** The page of one scene, as octasplat.view serves it. */
     async scene() {
         const page = await open();
@@ -250,7 +390,7 @@ const steps = {
         await page.waitForURL("**/jobs/*-*");
         await page.waitForSelector("#viewer[data-ready=yes]");
         await tabTo(() => document.activeElement.tagName === "CANVAS");
-        const picture = () => page.locator("#viewer canvas").screenshot().then((png) => png.toString("base64"));
+        const picture = () => page.locator("#viewer canvas:not(.overlay)").screenshot().then((png) => png.toString("base64"));
         // The picture once it stands still.
         const still = async () => {
             await page.waitForSelector("#viewer[data-rested=yes]");
@@ -457,7 +597,7 @@ const steps = {
                 found.background[`${name} ${colorScheme}`] = await page.evaluate(() => getComputedStyle(document.body).backgroundColor);
                 await shot(page, `phone_${name}_${colorScheme}`);
                 if (name !== "job" || colorScheme !== "light") continue;
-                const canvas = page.locator("#viewer canvas"), box = await canvas.boundingBox();
+                const canvas = page.locator("#viewer canvas:not(.overlay)"), box = await canvas.boundingBox();
                 const before = (await canvas.screenshot()).toString("base64");
                 const touch = await page.context().newCDPSession(page);
                 await canvas.scrollIntoViewIfNeeded();

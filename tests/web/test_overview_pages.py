@@ -58,6 +58,45 @@ async def test_jobs_are_found_by_label_dataset_kind_and_end_of_id(
         assert names_in(part) == ["100% fox"] and "/parts/jobs?show=active&amp;q=fox" in part
 
 
+async def test_jobs_are_sorted_narrowed_to_a_kind_and_renamed(
+    connect_service: ConnectService, database: str
+) -> None:
+    async with connect_service() as (http, _):
+        scores = {"sort b": 20.0, "sort c": None, "Sort a": 31.5, "sort d": 25.0}
+        ids = {name: await make_job(database, label=name, kind="render") for name in scores}
+        async with open_pool(database, max_size=1, wait_seconds=10) as pool, pool.connection() as connection:
+            for name, psnr in scores.items():
+                await connection.execute("UPDATE jobs SET psnr = %s WHERE id = %s", [psnr, ids[name]])
+        for order, wanted in (
+            ("newest", ["sort d", "Sort a", "sort c", "sort b"]),
+            ("oldest", ["sort b", "sort c", "Sort a", "sort d"]),
+            ("name", ["Sort a", "sort b", "sort c", "sort d"]),
+            ("psnr", ["Sort a", "sort d", "sort b", "sort c"]),
+        ):
+            page = await http.get("/", params={"q": "sort", "order": order})
+            assert names_in(page.text) == wanted, order
+            found: list[str] = []
+            cursor: dict[str, str] = {}
+            for _part in range(9):  # part by part over HTTP, all kinds of jobs among them
+                query = {"kind": "render", "order": order, "limit": 1, **cursor}
+                part = (await http.get("/v1/jobs", params=query)).json()
+                found += [job["label"] for job in part["jobs"] if job["label"] in scores]
+                if part["next"] is None:
+                    break
+                cursor = {"cursor": part["next"]}
+            assert found == wanted, order
+        assert names_in((await http.get("/", params={"q": "sort", "kind": "reconstruct"})).text) == []
+        part = (await http.get("/parts/jobs", params={"kind": "render", "order": "psnr"})).text
+        assert 'href="/?show=done&amp;kind=render&amp;order=psnr"' in part
+        done = await http.post(
+            f"/jobs/{ids['sort b']}/label", data={"label": "  sort <z> "}, follow_redirects=False
+        )
+        assert done.status_code == 303
+        assert (await http.get(f"/v1/jobs/{ids['sort b']}")).json()["label"] == "sort <z>"
+        await http.post(f"/jobs/{ids['sort b']}/label", data={"label": " "})
+        assert (await http.get(f"/v1/jobs/{ids['sort b']}")).json()["label"] is None
+
+
 async def test_chosen_jobs_are_cancelled_and_deleted(connect_service: ConnectService, database: str) -> None:
     async with connect_service() as (http, _):
         ids = [await make_job(database, label=f"job {k}") for k in range(3)]

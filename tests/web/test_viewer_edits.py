@@ -155,7 +155,8 @@ def test_points_are_picked_where_half_of_the_light_is_stopped(tmp_path: Path) ->
     )
     np.testing.assert_allclose(found[0], [0, 0, 2], atol=1e-6)
     np.testing.assert_allclose(found[1], [0.2, 0.1, 2], atol=1e-6)
-    assert found[2] is None and found[3] is None
+    assert found[2] is None
+    np.testing.assert_allclose(found[3], [0, 0, 1], atol=1e-6)  # the veil alone stops most of what is stopped
 
 
 def test_links_keep_a_view_and_nothing_else_is_taken_for_one() -> None:

@@ -6,7 +6,7 @@ Every function takes a connection and works in one transaction of its own or of 
 import uuid
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, LiteralString
 
 from octasplat.workers.db.connections import Connection, fetch_all, fetch_one
 from octasplat.workers.db.errors import ConflictError, NotFoundError
@@ -16,6 +16,46 @@ from octasplat.workers.db.locks import about_to_lock_jobs, lock_owner
 from octasplat.workers.db.postgres_text import as_json, as_json_or_null, storable_text
 from octasplat.workers.db.rows import Artifact, Job
 from octasplat.workers.queue.protocol import JobQueue, NewEntry, QueueDepth
+
+JobOrder = Literal["newest", "oldest", "name", "psnr", "longest"]
+"""Newest first, oldest first, by name, best PSNR first, longest work first."""
+_MATCHING: LiteralString = """
+    (%(owner)s::text IS NULL OR owner = %(owner)s)
+      AND (cardinality(%(states)s::text[]) = 0 OR state = ANY(%(states)s))
+      AND (%(kind)s::text IS NULL OR kind = %(kind)s)
+      AND (%(label)s::text IS NULL OR label = %(label)s)
+      AND (%(dataset)s::uuid IS NULL OR dataset_id = %(dataset)s)
+      AND (%(text)s::text IS NULL OR strpos(lower(coalesce(label, '')), lower(%(text)s)) > 0
+           OR strpos(kind, lower(%(text)s)) > 0 OR right(id::text, length(%(text)s)) = lower(%(text)s)
+           OR EXISTS (SELECT FROM datasets AS d WHERE d.id = jobs.dataset_id
+                      AND strpos(lower(d.name), lower(%(text)s)) > 0))
+    """
+_NEWEST_JOBS: LiteralString = (
+    "SELECT {} FROM jobs WHERE (%(before)s::uuid IS NULL OR id < %(before)s) AND "  # noqa: S608 - constants
+    + _MATCHING
+    + "ORDER BY id DESC LIMIT %(limit)s"
+)
+_KEYS: LiteralString = """
+    CASE WHEN %(order)s = 'name' THEN
+        lower(coalesce(label, (SELECT d.name FROM datasets AS d WHERE d.id = jobs.dataset_id), kind))
+        ELSE '' END,
+    CASE %(order)s
+        WHEN 'psnr' THEN -coalesce(psnr, -1)::float8
+        WHEN 'longest' THEN -coalesce(extract(epoch FROM finished_at - started_at), -1)::float8
+        ELSE 0 END,
+    id
+    """
+_ORDERED_JOBS: LiteralString = (
+    "SELECT {} FROM jobs WHERE (%(before)s::uuid IS NULL OR ("  # noqa: S608 - constants
+    + _KEYS
+    + ") > (SELECT "
+    + _KEYS
+    + " FROM jobs WHERE id = %(before)s)) AND "
+    + _MATCHING
+    + "ORDER BY "
+    + _KEYS
+    + "LIMIT %(limit)s"
+)
 
 
 @dataclass(frozen=True)
@@ -96,9 +136,10 @@ async def list_jobs(
     dataset_id: uuid.UUID | None = None,
     text: str | None = None,
     before: uuid.UUID | None = None,
+    order: JobOrder = "newest",
     limit: int = 50,
 ) -> list[Job]:
-    """Return the jobs that match, newest first.
+    """Return the jobs that match, in an order.
 
     Args:
         connection: to the database.
@@ -108,26 +149,14 @@ async def list_jobs(
         label: with this label.
         dataset_id: on this dataset.
         text: with this in the label, the kind or the name of the dataset, or at the end of the id.
-        before: made before this job.
+        before: that come behind this job.
+        order: which come first.
         limit: at most so many.
     """
     return await fetch_all(
         connection,
         Job,
-        """
-            SELECT {} FROM jobs
-            WHERE (%(owner)s::text IS NULL OR owner = %(owner)s)
-              AND (cardinality(%(states)s::text[]) = 0 OR state = ANY(%(states)s))
-              AND (%(kind)s::text IS NULL OR kind = %(kind)s)
-              AND (%(label)s::text IS NULL OR label = %(label)s)
-              AND (%(dataset)s::uuid IS NULL OR dataset_id = %(dataset)s)
-              AND (%(before)s::uuid IS NULL OR id < %(before)s)
-              AND (%(text)s::text IS NULL OR strpos(lower(coalesce(label, '')), lower(%(text)s)) > 0
-                   OR strpos(kind, lower(%(text)s)) > 0 OR right(id::text, length(%(text)s)) = lower(%(text)s)
-                   OR EXISTS (SELECT FROM datasets AS d WHERE d.id = jobs.dataset_id
-                              AND strpos(lower(d.name), lower(%(text)s)) > 0))
-            ORDER BY id DESC LIMIT %(limit)s
-            """,
+        _NEWEST_JOBS if order == "newest" else _ORDERED_JOBS,
         {
             "text": text,
             "owner": owner,
@@ -136,6 +165,7 @@ async def list_jobs(
             "label": label,
             "dataset": dataset_id,
             "before": before,
+            "order": order,
             "limit": limit,
         },
     )

@@ -18,20 +18,26 @@ export function showEstimates(form, place, chosen) {
         const body = { kind: form.getAttribute("data-kind"), options: readOptions(form), queue };
         if (scene) body.photographs = await sizesOf(scene);
         else if (dataset) body.dataset_id = dataset;
-        if (!body.dataset_id && !body.photographs?.length) return show(number, "");
-        const response = await fetch("/v1/estimates", {
-            method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body),
-        }).catch(() => null);
-        const answer = await response?.json().catch(() => null);
+        if (!body.dataset_id && !body.photographs?.length) {
+            show(number, "");
+            return showPresets(number, null);
+        }
+        const { response, answer } = await estimateOf(body);
         if (response?.ok && answer?.estimate) show(number, `This takes ${answer.estimate.text}, within a factor of two.`);
         else if (response?.status === 422) show(number, [...new Set((answer?.errors ?? []).map((fault) => fault.detail))].join(" ") || answer?.detail);
         else show(number, "");
+        return showPresets(number, body);
     };
     const show = (number, text) => {
         if (number !== latest) return; // another question has been asked since
         place.textContent = text;
         place.hidden = !text;
     };
+    /** What each preset would take with the other options as they are. */
+    const showPresets = (number, body) => Promise.all([...form.querySelectorAll("output[data-preset]")].map(async (output) => {
+        const { answer } = body ? await estimateOf({ ...body, options: { ...body.options, preset: output.dataset.preset } }) : {};
+        if (number === latest) output.textContent = answer?.estimate ? answer.estimate.text.replace(/^./, (letter) => letter.toUpperCase()) : "";
+    }));
     const soon = () => {
         clearTimeout(timer);
         timer = setTimeout(ask, PAUSE_MS);
@@ -39,6 +45,13 @@ export function showEstimates(form, place, chosen) {
     form.addEventListener("input", soon);
     form.addEventListener("change", soon);
     return soon;
+}
+
+async function estimateOf(body) {
+    const response = await fetch("/v1/estimates", {
+        method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body),
+    }).catch(() => null);
+    return { response, answer: await response?.json().catch(() => null) };
 }
 
 /** The size of one photograph, taken for that of all; nothing where the browser cannot read it. */

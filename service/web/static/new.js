@@ -2,20 +2,25 @@
 
 import { showEstimates } from "./estimate.js";
 import { fillOptions, followPreset, queueJob, readOptions } from "./options.js";
-import { chosenFiles, droppedFiles, sceneOf } from "./scene_files.js";
+import { chosenFiles, droppedFiles, scenesOf } from "./scene_files.js";
 import { Upload } from "./upload.js";
 import { thousands } from "./numbers.js";
 
 const form = document.getElementById("new-job");
 const find = (id) => document.getElementById(id);
 const drop = find("drop"), known = find("dataset"), start = find("start"), pause = find("pause"), faults = find("faults");
-let scene = null, upload = null, choice = 0;
+let scenes = null, upload = null, choice = 0; // several scenes become a job each
 
 // By their attributes: a field of the form has the id "dataset".
 const kind = form.getAttribute("data-kind"), given = form.getAttribute("data-given");
 if (given) fillOptions(form, JSON.parse(given));
 followPreset(form);
-const estimateAnew = showEstimates(form, find("estimate"), () => ({ scene, dataset: known?.value, queue: find("queue")?.value ?? "cpu" }));
+const estimateAnew = showEstimates(form, find("estimate"), () => ({ scene: largest(), dataset: known?.value, queue: find("queue")?.value ?? "cpu" }));
+
+/** The chosen scene, of several the one that takes the longest. */
+function largest() {
+    return scenes && scenes.reduce((one, other) => (other.photographs > one.photographs ? other : one));
+}
 
 function size(bytes) {
     const units = ["B", "kB", "MB", "GB", "TB"];
@@ -41,12 +46,12 @@ async function choose(found) {
     const number = ++choice;
     start.disabled = true;
     try {
-        const chosen = await sceneOf(found);
+        const chosen = await scenesOf(found);
         if (number !== choice) return; // others have been chosen since
-        scene = chosen;
+        scenes = chosen;
     } catch (error) {
         if (number !== choice) return;
-        scene = null;
+        scenes = null;
         show();
         complain(error.faults ? "This cannot be used as it is:" : error.message, error.faults);
         return;
@@ -58,21 +63,29 @@ async function choose(found) {
     find("chosen-text").focus();
 }
 
+function describe(scene) {
+    const what = `${scene.archive ? `${scene.archive.name}, ` : ""}${thousands(scene.photographs)} photographs${scene.posed ? " and a COLMAP model" : ""}`;
+    return `${scene.title && !scene.archive ? `${scene.title}: ` : ""}${what}, ${size(scene.bytes)}`;
+}
+
 /** Shows what was chosen, and what the button will do. */
 function show() {
-    drop.hidden = scene !== null;
-    find("chosen").hidden = scene === null;
+    drop.hidden = scenes !== null;
+    find("chosen").hidden = scenes === null;
     const notes = find("chosen-notes");
     notes.replaceChildren();
-    if (scene) {
-        const what = `${scene.archive ? `${scene.archive.name}, ` : ""}${thousands(scene.photographs)} photographs${scene.posed ? " and a COLMAP model" : ""}`;
-        find("chosen-text").textContent = `${scene.title && !scene.archive ? `${scene.title}: ` : ""}${what}, ${size(scene.bytes)}`;
+    if (scenes) {
         const add = (text) => notes.append(Object.assign(document.createElement("li"), { textContent: text }));
-        if (!scene.posed) add("There is no COLMAP model, so the poses are found first; that takes a while.");
-        scene.notes.forEach(add);
-        find("label").placeholder = scene.title || "as the folder";
+        const only = scenes.length === 1 ? scenes[0] : null;
+        find("chosen-text").textContent = only ? describe(only) : `${scenes.length} scenes, a job each, ${size(scenes.reduce((sum, { bytes }) => sum + bytes, 0))}`;
+        for (const scene of scenes) {
+            if (!only) add(describe(scene));
+            if (!scene.posed) add("There is no COLMAP model, so the poses are found first; that takes a while.");
+            scene.notes.forEach(add);
+        }
+        find("label").placeholder = only?.title || "as the folder";
     }
-    start.textContent = known?.value && !scene ? "Start" : "Upload and start";
+    start.textContent = known?.value && !scenes ? "Start" : scenes?.length > 1 ? `Upload and start ${scenes.length} jobs` : "Upload and start";
     estimateAnew();
 }
 
@@ -101,13 +114,13 @@ document.addEventListener("drop", async (event) => {
 find("forget").addEventListener("click", () => {
     choice += 1;
     start.disabled = false;
-    scene = null;
+    scenes = null;
     show();
     form.querySelectorAll("input[type=file]").forEach((input) => { input.value = ""; });
     form.querySelector("label.button").focus();
 });
 known?.addEventListener("change", () => {
-    if (known.value) scene = null;
+    if (known.value) scenes = null;
     show();
 });
 
@@ -142,27 +155,34 @@ pause.addEventListener("click", () => {
 
 addEventListener("beforeunload", (event) => { if (upload) event.preventDefault(); });
 
+/** Sends a scene, or takes the dataset that is chosen, and queues its job; returns that. */
+async function startOne(scene, label, isOneOfMany) {
+    let id = known?.value;
+    if (scene) {
+        paces.length = 0;
+        upload = new Upload(scene, scene.title || label || "photographs", tell);
+        pause.hidden = false;
+        id = (await upload.run()).id;
+    }
+    const body = { kind, dataset_id: id, options: readOptions(form), queue: find("queue")?.value ?? "cpu" };
+    if (label) body.label = isOneOfMany ? `${label}: ${scene.title}` : label;
+    return queueJob(body, `page-${id}-${Date.now()}`);
+}
+
 form.addEventListener("submit", async (event) => {
     event.preventDefault();
     faults.hidden = true;
-    if (!scene && !known?.value) {
+    if (!scenes && !known?.value) {
         complain("Choose photographs first.");
         return;
     }
     start.disabled = true;
     try {
-        let id = known?.value;
         const label = find("label").value.trim();
-        if (scene) {
-            upload = new Upload(scene, scene.title || label || "photographs", tell);
-            pause.hidden = false;
-            id = (await upload.run()).id;
-        }
-        const body = { kind, dataset_id: id, options: readOptions(form), queue: find("queue")?.value ?? "cpu" };
-        if (label) body.label = label;
-        const job = await queueJob(body, `page-${id}-${Date.now()}`);
+        const queued = [];
+        for (const scene of scenes ?? [null]) queued.push(await startOne(scene, label, scenes?.length > 1));
         upload = null;
-        location.href = `/jobs/${job}`;
+        location.href = queued.length > 1 ? "/" : `/jobs/${queued[0]}`;
     } catch (error) {
         upload = null;
         complain(error.faults?.length ? "This cannot be used as it is:" : error.message, error.faults);

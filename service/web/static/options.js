@@ -17,6 +17,7 @@ export function readOptions(form) {
 
 function valueOf(field) {
     if (field.dataset.type.startsWith("upload")) return uploadNames(field);
+    if (field.dataset.type === "radio") return field.querySelector("input:checked")?.value;
     if (field.dataset.type === "files") return [...field.querySelectorAll("input:checked")].map((box) => box.value);
     const text = field.value.trim();
     if (text === "") return undefined;
@@ -48,7 +49,7 @@ export function followPreset(form) {
     const preset = form.querySelector("[data-path=preset]");
     if (!preset) return;
     const show = () => {
-        const name = preset.value || preset.dataset.default;
+        const name = valueOf(preset) ?? preset.dataset.default;
         for (const field of form.querySelectorAll("[data-defaults]:not([data-defaults=''])")) {
             const text = JSON.parse(field.dataset.defaults)[name] ?? "";
             if (field.tagName === "SELECT") field.options[0].textContent = `${text || "as is"} (default)`;
@@ -63,7 +64,7 @@ export function followPreset(form) {
 export function fillOptions(form, given) {
     const valueAt = (path) => path.split(".").reduce((section, name) => section?.[name], given);
     const preset = form.querySelector("[data-path=preset]");
-    if (preset && given.preset && given.preset !== preset.dataset.default) preset.value = given.preset;
+    if (preset && given.preset) preset.querySelector(`[value="${CSS.escape(given.preset)}"]`)?.click();
     for (const field of form.querySelectorAll("[data-path]")) {
         const value = valueAt(field.dataset.path);
         if (value === undefined || value === null || field === preset || field.dataset.type.startsWith("upload")) continue;

@@ -33,6 +33,31 @@ export function chosenFiles(input) {
     return [...input.files].map((file) => ({ path: file.webkitRelativePath || file.name, file }));
 }
 
+/** Folders of one scene; whoever drops these beside each other means one. */
+const PARTS_OF_A_SCENE = new Set(["images", "masks", "sparse", "colmap", "depth", "normal"]);
+
+/** The scenes of what was chosen: one each for several archives or folders beside each other, else a single one. */
+export async function scenesOf(found) {
+    const groups = new Map();
+    for (const item of found) {
+        const first = item.path.split("/")[0];
+        groups.set(first, [...(groups.get(first) ?? []), item]);
+    }
+    const names = [...groups.keys()];
+    const areScenes = names.length > 1 && names.every((name) => !PARTS_OF_A_SCENE.has(name.toLowerCase()) && (ARCHIVE.test(name) || groups.get(name).every(({ path }) => path.includes("/"))));
+    if (!areScenes) return [await sceneOf(found)];
+    const scenes = [];
+    for (const name of names) {
+        try {
+            scenes.push(await sceneOf(groups.get(name)));
+        } catch (error) {
+            const sentences = error.faults ?? [error.message];
+            throw Object.assign(new Error(`${name}: ${error.message}`), { faults: sentences.map((sentence) => `${name}: ${sentence}`) });
+        }
+    }
+    return scenes;
+}
+
 /**
  * What to send: {archive} or {files: [{name, file}]}, what the scene may be called, and notes on what is left out.
  * Throws an error with sentences for the user where the service would refuse it.

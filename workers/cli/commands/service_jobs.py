@@ -22,20 +22,37 @@ STATES = ("queued", "running", "canceling", "succeeded", "failed", "canceled")
 
 @click.command(short_help="List jobs.")
 @click.option("--state", multiple=True, type=click.Choice(STATES), help="Only these; may be repeated.")
+@click.option("--kind", metavar="KIND", help="Only those of this kind, such as render.")
 @click.option("--label", metavar="TEXT", help="Only those with exactly this label.")
+@click.option(
+    "--sort",
+    type=click.Choice(("newest", "oldest", "name", "psnr", "longest")),
+    default="newest",
+    show_default=True,
+    help="Which come first; psnr is the best one, longest the most work.",
+)
 @limit_option
 @server_option
 @output_options
-def jobs(state: tuple[str, ...], label: str | None, limit: int, server: str | None, printer: Printer) -> None:
-    """List jobs, the newest first.
+def jobs(
+    state: tuple[str, ...],
+    kind: str | None,
+    label: str | None,
+    sort: str,
+    limit: int,
+    server: str | None,
+    printer: Printer,
+) -> None:
+    """List jobs, the newest first unless sorted otherwise.
 
     Every command takes the id that is shown, a whole one of the JSON output, or 'last'.
     """
     from octasplat.workers.client.short_ids import list_rows, short_id
 
     query: dict[str, Any] = {"state": list(state)} if state else {}
-    if label is not None:
-        query["label"] = label
+    query |= {name: value for name, value in (("kind", kind), ("label", label)) if value is not None}
+    if sort != "newest":
+        query["order"] = sort
     with connected(server) as api:
         found = list(list_rows(api, "jobs", limit=limit, **query))
     rows = [

@@ -47,6 +47,7 @@ export class Overlay {
             this.begin(heldOut ? "#ffb020" : "#4da3ff", 1);
             this.frusta.forEach((frustum, k) => {
                 if (frustum.heldOut !== heldOut || k === this.chosen) return;
+                if (this.a.fromArray(frustum.corners[0]).distanceTo(camera.position) < frustum.depth) return; // it would fill the view
                 const [centre, ...corners] = frustum.corners;
                 corners.forEach((corner, c) => {
                     this.line(camera, centre, corner);
@@ -139,5 +140,5 @@ function frustumOf({ position, forward, up, fov_y_degrees: fovY, aspect, held_ou
     const f = new Vector3().fromArray(forward), u = new Vector3().fromArray(up), r = new Vector3().crossVectors(f, u);
     const high = depth * Math.tan((fovY * Math.PI) / 360), wide = high * aspect;
     const corner = (x, y) => new Vector3().fromArray(position).addScaledVector(f, depth).addScaledVector(r, x * wide).addScaledVector(u, y * high).toArray();
-    return { heldOut, corners: [position, corner(-1, -1), corner(1, -1), corner(1, 1), corner(-1, 1)] };
+    return { heldOut, depth, corners: [position, corner(-1, -1), corner(1, -1), corner(1, 1), corner(-1, 1)] };
 }

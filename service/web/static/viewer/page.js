@@ -48,6 +48,7 @@ class Viewer extends LoadingViewer {
     }
 
     async start() {
+        const { scene: asked } = this.box.dataset;
         this.say("Loading the scene");
         this.isLoading = true;
         try {
@@ -64,7 +65,7 @@ class Viewer extends LoadingViewer {
         } catch (error) {
             this.fail(error);
         }
-        this.isLoading = false;
+        this.endLoading(asked);
     }
 
     load(views) {
@@ -118,24 +119,29 @@ class Viewer extends LoadingViewer {
     }
 
     /** Another state of the scene has come: it is shown in the place of the one before, from where the camera is. */
-    async renew({ scene, size, count }) {
-        this.box.dataset.scene = scene;
-        this.box.dataset.size = size ?? this.box.dataset.size;
+    async renew({ scene, count }) {
+        Object.assign(this.box.dataset, { scene, count });
+        if (this.isLoading) return; // which looks again in the end
         if (!this.frame) {
-            if (!this.isLoading) await this.start();
-        } else if (!this.isLoading) {
-            this.isLoading = true;
-            try {
-                const cameras = await this.loadCameras();
-                const found = await this.load(cameras.views);
-                await this.splats.setScene(found, this.q);
-                this.setScene(found, cameras);
-            } catch (error) {
-                this.place.textContent = error.message; // the state before stays
-            }
-            this.isLoading = false;
+            await this.start();
+            return;
         }
-        if (count) this.box.querySelector(".count").textContent = count;
+        this.isLoading = true;
+        try {
+            const cameras = await this.loadCameras();
+            const found = await this.load(cameras.views);
+            await this.splats.setScene(found, this.q);
+            this.setScene(found, cameras);
+        } catch (error) {
+            this.place.textContent = error.message; // the state before stays
+        }
+        this.endLoading(scene);
+    }
+
+    endLoading(loaded) {
+        this.isLoading = false;
+        const { scene, count } = this.box.dataset;
+        if (this.frame && scene !== loaded) this.renew({ scene, count });
     }
 
     async loadCameras() {
@@ -190,7 +196,7 @@ class Viewer extends LoadingViewer {
             this.veil.hidden = true;
         });
         this.scene = scene;
-        this.box.querySelector(".count").textContent = `${thousands(scene.count)} Gaussians`;
+        this.box.querySelector(".count").textContent = this.box.dataset.count || `${thousands(scene.count)} Gaussians`;
         this.box.querySelectorAll(".with-views").forEach((part) => { part.hidden = !this.frame.views.length || (part.matches(".with-photographs") && !this.box.dataset.photographs); });
         this.listViews();
         if (this.overlay.frusta) this.overlay.showFrusta(this.frame.views, this.frame.radius);
@@ -205,7 +211,7 @@ class Viewer extends LoadingViewer {
         this.box.querySelector(".views").value = chosen;
         const unplaced = this.frame.unplaced ?? [], list = this.box.querySelector(".unplaced");
         list.hidden = !unplaced.length;
-        list.querySelector("summary").textContent = `${unplaced.length} photographs were not placed`;
+        list.querySelector("summary").textContent = unplaced.length === 1 ? "1 photograph was not placed" : `${unplaced.length} photographs were not placed`;
         list.querySelector("ul").replaceChildren(...unplaced.map((name) => Object.assign(document.createElement("li"), { textContent: name })));
     }
 

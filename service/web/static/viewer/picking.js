@@ -1,11 +1,12 @@
-// What a ray through a pixel hits first, as the scene is drawn: octagons, nearest first, until half the light is stopped.
+// What a ray through a pixel shows, as the scene is drawn: octagons, nearest first, until half the light is stopped.
 
 const COSINE = Math.cos(Math.PI / 8);
 const HALF = 0.5;
+const LEAST_SHARE = 0.05; // of the light; what stops less cannot be meant
 
 /**
- * The point at which half of a ray's light has been stopped; null where it never is. Arrays are as of ply.js,
- * `q` is the squared radius of an octagon in standard deviations, and `hidden` has 1 for Gaussians to pass by.
+ * The point at which half of a ray's light has been stopped, or where less is, that at which most of it was;
+ * null where there is nothing. Arrays are as of ply.js, `q` is the squared radius of an octagon in standard deviations, and `hidden` has 1 for Gaussians to pass by.
  */
 export function pick({ count, geometry }, origin, direction, q, hidden = null) {
     const hits = [];
@@ -27,12 +28,15 @@ export function pick({ count, geometry }, origin, direction, q, hidden = null) {
         hits.push([t, geometry[g + 3] * Math.exp(-0.5 * squared)]);
     }
     hits.sort((one, other) => one[0] - other[0]);
-    let light = 1;
+    let light = 1, most = LEAST_SHARE, place = null;
     for (const [t, alpha] of hits) {
+        if (alpha * light > most) [most, place] = [alpha * light, t];
         light *= 1 - alpha;
-        if (light <= HALF) return direction.map((value, k) => origin[k] + t * value);
+        if (light > HALF) continue;
+        place = t;
+        break;
     }
-    return null;
+    return place === null ? null : direction.map((value, k) => origin[k] + place * value);
 }
 
 function isInOctagon(u, v, reach) {

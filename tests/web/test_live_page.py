@@ -1,0 +1,121 @@
+"""A training is watched in 3D on its page; its result is measured, annotated and cropped there."""
+
+import json
+import shutil
+import threading
+import uuid
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
+from octasplat.engine.edit.cleaning import clean
+from octasplat.engine.edit.edit_options import Selection
+from octasplat.engine.edit.selection import selection_mask
+from octasplat.engine.files import read_scene
+from octasplat.engine.files.gaussian_ply import write_gaussian_ply
+from octasplat.engine.operations.clean import CleanOptions
+from octasplat.engine.runs.run_folder import run_camera_clearance
+from octasplat.workers.cli.main import cli
+from octasplat.workers.worker.live_scene import heaviest
+from tests.support.npm_packages import npm_folder
+from tests.support.service_harness import TOKEN
+from tests.support.web_harness import Browse, RunningService
+
+pytestmark = [pytest.mark.tools, pytest.mark.heavy]
+
+RUN = (
+    "--preset", "fast", "--iterations", "60", "--rays-per-batch", "256", "--max-gaussians", "500",
+    "--threads", "1", "--set", "initial_points=400", "--set", "probe_rays=256", "--test-every", "4",
+    "--exports", "", "-q",
+)  # fmt: skip
+AXE = ("axe-core", "4.10.3")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scene with a photograph that has no place, a run of it, and a state of its training."""
+    root = tmp_path_factory.mktemp("live")
+    config = SyntheticDatasetConfig(views=8, width_px=96, height_px=72, samples_per_side=1, points=500)
+    write_synthetic_dataset(root / "scene", config)
+    shutil.copy(root / "scene" / "images" / "view_000.png", root / "scene" / "images" / "without a place.png")
+    done = CliRunner().invoke(cli, ["reconstruct", str(root / "scene"), "-o", str(root / "run"), *RUN])
+    assert done.exit_code == 0, done.output
+    write_gaussian_ply(heaviest(read_scene(root / "run" / "scene.ply")[0], 200), root / "state.ply")
+    return root
+
+
+@pytest.fixture(scope="module")
+def job(service: RunningService, folder: Path) -> uuid.UUID:
+    """A reconstruction that nobody has worked on yet."""
+    command = ("submit", folder / "scene", "--queue", "nobody", "--server", service.url, "-q")
+    done = CliRunner().invoke(cli, [str(part) for part in command], env={"OCTASPLAT_TOKEN": TOKEN})
+    assert done.exit_code == 0, done.output
+    return uuid.UUID(done.stdout.strip().splitlines()[-1])
+
+
+@pytest.fixture(scope="module")
+def axe() -> str:
+    return str(npm_folder(*AXE) / "node_modules" / "axe-core")
+
+
+def test_training_is_watched_in_3d(
+    service: RunningService, browse: Browse, folder: Path, job: uuid.UUID, axe: str
+) -> None:
+    service.worker.run(job, folder / "run", until=30)
+    states = [
+        threading.Timer(
+            seconds,
+            service.worker.show_live,
+            (job, folder / "state.ply", folder / "run" / "views.json"),
+            {"step": step, "gaussians": 200},
+        )
+        for seconds, step in ((8.0, 0), (20.0, 30))
+    ]
+    for state in states:
+        state.start()
+    found = browse("live", service.url, job=str(job), axe=axe)
+    assert found["complaints"] == [] and found["faults"] == []
+    assert found["before"] == "The scene appears here as soon as the poses of the photographs are known."
+    assert found["count"] == "Step 30, 200 Gaussians"
+    assert len(found["views"]) == 9 and found["views"][0] == "8 photographs"
+    held_out = json.loads((folder / "run" / "held_out.json").read_text())
+    assert [name for name in found["views"] if "held out" in name] == [
+        f"{name} (held out)" for name in held_out
+    ]
+    assert found["unplaced"] == ["1 photograph was not placed", "without a place.png"]
+    assert found["marks"][0] == 0 < found["marks"][1]
+    assert found["place"] == f"{held_out[0]} (held out)"
+    photograph = found["photograph"]
+    assert (photograph["alt"], photograph["width"]) == (f"Photograph {held_out[0]}", 96)
+    assert photograph["ratio"] == pytest.approx(96 / 72, rel=0.01) and photograph["covers"] <= 1.01
+    assert found["corner"]
+
+
+def test_result_is_measured_annotated_and_cropped(
+    service: RunningService, browse: Browse, folder: Path, axe: str
+) -> None:
+    command = ("submit", folder / "scene", "--queue", "nobody", "--server", service.url, "-q")
+    done = CliRunner().invoke(cli, [str(part) for part in command], env={"OCTASPLAT_TOKEN": TOKEN})
+    result = uuid.UUID(done.stdout.strip().splitlines()[-1])
+    service.worker.run(result, folder / "run")
+    found = browse("edit", service.url, seconds=150, job=str(result), axe=axe)
+    assert found["complaints"] == [] and found["faults"] == []
+    distance, words = found["distance"]
+    assert 0 < distance < 10 and words == f"Distance {distance:.4g} in the scene's units"
+    assert found["notes"] == ["the middle <b>"]
+    numbers = [[float(x) for x in link.removeprefix("#view=").split(",")] for link in found["links"]]
+    np.testing.assert_allclose(numbers[0], numbers[1], rtol=1e-3, atol=1e-3)
+    scene = read_scene(folder / "run" / "scene.ply")[0]
+    keep, report = clean(scene, CleanOptions(), run_camera_clearance(folder / "run", 0.25))
+    assert found["cleaned"]["kept"] == keep.sum() and found["cleaned"]["faint"] == report.faint
+    queued = service.request("GET", f"/v1/jobs/{found['job']}")
+    assert queued["kind"] == "crop" and queued["source_id"] == str(result)
+    kept = selection_mask(scene, Selection(box=queued["options"]["box"]), (0.0, 0.0, 0.0))
+    assert found["cropped"]["kept"] == kept.sum() < len(scene)
+    assert found["said"].startswith(f"{kept.sum()} Gaussians stay; {(~kept).sum()} outside the box")
+    assert found["differs"] > 1
+    notes = service.request("GET", f"/v1/jobs/{result}")["view_notes"]
+    assert [note["text"] for note in notes] == ["the middle <b>"] and len(notes[0]["camera"]) == 6
