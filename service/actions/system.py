@@ -98,7 +98,7 @@ async def set_worker_drained(service: Service, principal: Principal, name: str, 
         found = await _queue_list(connection, service, principal)
         workers = [view for view in found.workers if view.name == name]
         if not workers:
-            raise not_found_error("live worker of that name")
+            raise not_found_error("live worker")
     return workers[0]
 
 

@@ -13,6 +13,7 @@ from PIL import Image
 from octasplat.service.app import create_app
 from octasplat.service.settings import ServiceSettings
 from octasplat.service.state import Service
+from octasplat.workers.db.live_scenes import LiveScene, put_live_scene
 from octasplat.workers.queue.attempts import ResultFile
 from tests.support.api_inventory import Operation, operations, undescribed
 from tests.support.service_harness import (
@@ -72,7 +73,10 @@ class Stage:
         await attempt.add_log_lines(["a line of-me"])
         await attempt.record_preview({"sha256": sha256, "step": 1, "view": "a.png"})
         size = len(picture.getvalue())
+        state = LiveScene(uuid.UUID(job_id), sha256, sha256, 1, 1)
         await attempt.succeed([ResultFile("scene.ply", sha256, size, "application/octet-stream")])
+        async with self.service.pool.connection() as connection:
+            await put_live_scene(connection, state)
         self.ids = {
             "dataset_id": open_dataset, "job_id": job_id, "path": "images/a.png", "name": "scene.ply",
             "kind": "toy", "queue": "cpu", "worker": "box",

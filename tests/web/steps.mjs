@@ -340,12 +340,17 @@ const steps = {
         found.cropped = JSON.parse(await page.getAttribute("#viewer", "data-edited"));
         found.said = await page.textContent("#edit .edit-state");
         await ready();
-        const shown = await brightness(page);
         await shot(page, "crop");
+        const look = async () => {
+            await page.evaluate(() => document.querySelector("#viewer .screen").scrollIntoView({ block: "center" }));
+            await page.waitForTimeout(300);
+            return (await brightness(page)).mean;
+        };
+        const shown = await look();
         await page.click("#edit [data-show=removed]");
         await page.waitForTimeout(400);
         await ready();
-        found.differs = Math.abs((await brightness(page)).mean - shown.mean);
+        found.differs = Math.abs(await look() - shown);
         found.faults = await portray(`/jobs/${job.job}`, "edit", async (other) => {
             await other.waitForSelector("#viewer[data-rested=yes]");
             await other.click("#edit > summary");

@@ -19,7 +19,7 @@ from octasplat.engine.train.initialization.initial_gaussians import gaussians_fr
 
 SCENE_FILE, VIEWS_FILE = ".live_scene.ply", ".live_views.json"
 MAX_GAUSSIANS = 30_000
-"""Most Gaussians of the file, which takes 62 bytes for each."""
+"""Most Gaussians of the file, which takes 68 bytes for each."""
 INTERVAL_SECONDS = 15.0
 AGE_FRACTION = 0.05
 """The older a training, the less it changes: the next file comes after this share of its time."""
