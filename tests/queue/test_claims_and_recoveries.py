@@ -1,0 +1,206 @@
+"""What claiming and recovering a job writes down, and that neither waits for who holds the job."""
+
+import asyncio
+import logging
+from datetime import UTC, datetime, timedelta
+
+import pytest
+
+from octasplat.workers.db.connections import Pool, open_pool
+from octasplat.workers.db.events_and_logs import list_job_events, list_log_lines
+from octasplat.workers.db.rows import Job
+from octasplat.workers.queue import attempts
+from octasplat.workers.queue.attempts import Attempt, claim
+from octasplat.workers.queue.job_endings import recover_attempt
+from octasplat.workers.queue.jobs import cancel_job, get_job
+from octasplat.workers.queue.recovery import StalledAttempts, recover_stalled_jobs
+from tests.support.queue_jobs import SLIPS, claimed, fetched
+
+SOON_SECONDS = 5.0
+"""What waits for nobody takes less, also on a busy machine."""
+LOST = {"type": "worker_lost", "message": "It is gone.", "exit_code": 9}
+
+
+async def events_of(pool: Pool, job: Job, kind: str) -> list[tuple[int, object]]:
+    async with pool.connection() as connection:
+        events = await list_job_events(connection, job.id)
+    return [(event.attempt, event.data) for event in events if event.kind == kind]
+
+
+async def log_of(pool: Pool, job: Job) -> list[tuple[int, str]]:
+    async with pool.connection() as connection:
+        return [(line.attempt, line.text) for line in await list_log_lines(connection, job.id)]
+
+
+async def turn_of(pool: Pool, job: Job) -> datetime:
+    async with pool.connection() as connection:
+        cursor = await connection.execute("SELECT turn_at FROM owner_turns WHERE owner = %s", [job.owner])
+        row = await cursor.fetchone()
+    assert row is not None
+    turn: datetime = row["turn_at"]
+    return turn
+
+
+async def entries(pool: Pool) -> set[int]:
+    async with pool.connection() as connection:
+        cursor = await connection.execute("SELECT id FROM procrastinate_jobs")
+        return {row["id"] for row in await cursor.fetchall()}
+
+
+async def delay_of(pool: Pool, job: Job) -> float:
+    async with pool.connection() as connection:
+        cursor = await connection.execute(
+            "SELECT coalesce(extract(epoch FROM delayed_until - now()), 0) AS s FROM jobs WHERE id = %s",
+            [job.id],
+        )
+        row = await cursor.fetchone()
+    assert row is not None
+    return float(row["s"])
+
+
+async def recover(pool: Pool, attempt: Attempt, **options: object) -> bool:
+    """Recover an attempt with the error ``LOST``."""
+    async with pool.connection() as connection, connection.transaction():
+        job = await get_job(connection, attempt.job.id, lock=True)
+        assert job is not None
+        return await recover_attempt(connection, SLIPS, job, LOST, **options)  # type: ignore[arg-type]
+
+
+async def make_old(pool: Pool, job: Job) -> None:
+    async with pool.connection() as connection:
+        await connection.execute(
+            "UPDATE jobs SET heartbeat_at = now() - interval '1 hour' WHERE id = %s", [job.id]
+        )
+
+
+async def test_claim_begins_an_attempt_anew(conninfo: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    async with open_pool(conninfo, max_size=4) as pool:
+        first = await claimed(pool)
+        job = first.job
+        assert job.started_at is not None and job.heartbeat_at is not None
+        assert datetime.now(UTC) - job.started_at < timedelta(minutes=1)
+        assert await events_of(pool, job, "state") == [
+            (0, {"state": "queued"}), (1, {"state": "running", "worker": "w"}),
+        ]  # fmt: skip
+        assert await log_of(pool, job) == [(1, "Attempt 1")]
+        first_turn = await turn_of(pool, job)
+        await first.set_progress(stage="train", step=3, total_steps=9, seconds_left=5.0)
+        await first.add_log_lines(["a", "b", "c"])
+        await first.requeue(SLIPS, "test")
+        monkeypatch.setattr(attempts, "MAX_EARLIER_LOG_LINES", 2)
+        again = await fetched(pool, job.id)
+        assert again.slip is not None
+        second = await claim(pool, job.id, again.slip, "other")
+        assert second is not None
+        begun = second.job
+        assert (begun.state, begun.attempt, begun.worker) == ("running", 2, "other")
+        assert begun.started_at is not None and begun.started_at > job.started_at
+        assert begun.heartbeat_at is not None and begun.heartbeat_at > job.heartbeat_at
+        assert (begun.stage, begun.step, begun.total_steps, begun.seconds_left) == (None,) * 4
+        assert (await events_of(pool, job, "state"))[-1] == (2, {"state": "running", "worker": "other"})
+        lines = await log_of(pool, job)
+        assert lines[0] == (1, "c") and lines[-1] == (2, "Attempt 2") and len(lines) == 3
+        assert await turn_of(pool, job) > first_turn
+
+
+async def test_recovery_passes_over_jobs_that_others_hold(conninfo: str) -> None:
+    async with open_pool(conninfo, max_size=4) as pool:
+        held, free = await claimed(pool), await claimed(pool)
+        for attempt in (held, free):
+            await make_old(pool, attempt.job)
+        async with pool.connection() as other, other.transaction():
+            assert await get_job(other, held.job.id, lock=True) is not None
+            async with asyncio.timeout(SOON_SECONDS):
+                assert await recover_stalled_jobs(pool, SLIPS, 5, StalledAttempts(0.0)) == 1
+        assert [(await fetched(pool, a.job.id)).state for a in (held, free)] == ["running", "queued"]
+
+
+async def test_recovery_names_the_lost_worker(conninfo: str, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.WARNING, "octasplat.workers.queue.recovery")
+    async with open_pool(conninfo, max_size=4) as pool:
+        attempt = await claimed(pool)
+        async with pool.connection() as connection:
+            await connection.execute("UPDATE jobs SET rescues = 3")
+        await make_old(pool, attempt.job)
+        assert await recover_stalled_jobs(pool, SLIPS, 5, StalledAttempts(0.0)) == 1
+        job = await fetched(pool, attempt.job.id)
+        assert job.error is not None and job.error["type"] == "worker_lost" and job.error["rescues"] == 3
+        assert job.error["message"].startswith("The worker w was not heard of for 5 s: ")
+        assert [record.message for record in caplog.records] == [f"worker w was lost with job {job.id}"]
+
+
+async def test_recovery_logs_entries_that_were_lost(conninfo: str, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.WARNING, "octasplat.workers.queue.recovery")
+    async with open_pool(conninfo, max_size=4) as pool:
+        attempt = await claimed(pool)
+        await attempt.requeue(SLIPS, "test")
+        async with pool.connection() as connection:
+            await connection.execute("UPDATE jobs SET queued_at = now() - interval '1 hour'")
+            await connection.execute("DELETE FROM procrastinate_jobs")
+        assert await recover_stalled_jobs(pool, SLIPS, 5, StalledAttempts(0.0)) == 0
+        assert [record.message for record in caplog.records] == [
+            f"job {attempt.job.id} had no slip in the queue and got a new one"
+        ]
+
+
+async def test_attempts_are_stalled_only_while_they_do_not_change(conninfo: str) -> None:
+    async with open_pool(conninfo, max_size=4) as pool:
+        job = (await claimed(pool)).job
+    stalled = StalledAttempts(0.2)
+    assert stalled.confirm([job]) == []
+    await asyncio.sleep(0.25)
+    assert stalled.confirm([job]) == [job]
+    assert stalled.confirm([]) == []
+    assert stalled.confirm([job]) == []  # found anew
+
+
+async def test_recovered_attempt_is_written_down(conninfo: str) -> None:
+    async with open_pool(conninfo, max_size=4) as pool:
+        attempt = await claimed(pool)
+        assert not await recover(pool, attempt, delay_seconds=3600.0)
+        job = await fetched(pool, attempt.job.id)
+        assert (job.state, job.rescues, job.attempt) == ("queued", 1, 1)
+        assert job.slip is not None and job.slip != attempt.job.slip
+        assert await events_of(pool, job, "rescued") == [(1, {"reason": "It is gone.", "rescues": 1})]
+        assert (1, "Lost, and queued again: It is gone.") in await log_of(pool, job)
+        assert job.waits_for == "It is gone."
+        assert 3000 < await delay_of(pool, job) <= 3600
+        assert await entries(pool) == {job.slip}
+
+
+async def test_recovered_attempt_keeps_an_entry_under_delivery(conninfo: str) -> None:
+    async with open_pool(conninfo, max_size=4) as pool:
+        attempt = await claimed(pool)
+        assert not await recover(pool, attempt, keep_entry=True)
+        job = await fetched(pool, attempt.job.id)
+        assert await entries(pool) == {attempt.job.slip, job.slip}
+        assert await delay_of(pool, job) == 0
+
+
+async def test_attempt_that_was_lost_too_often_fails_its_job(conninfo: str) -> None:
+    async with open_pool(conninfo, max_size=4) as pool:
+        attempt = await claimed(pool)
+        assert await recover(pool, attempt, max_recoveries=0)
+        job = await fetched(pool, attempt.job.id)
+        message = "It is gone. This happened 1 times without getting any further."
+        assert (job.state, job.error) == ("failed", {**LOST, "message": message, "rescues": 0})
+        assert await events_of(pool, job, "rescued") == []
+        assert await entries(pool) == set()
+
+
+async def test_attempt_at_a_canceled_job_that_is_lost_ends_it(conninfo: str) -> None:
+    async with open_pool(conninfo, max_size=4) as pool:
+        attempt = await claimed(pool)
+        async with pool.connection() as connection:
+            await cancel_job(connection, SLIPS, attempt.job.id)
+        assert not await recover(pool, attempt, max_recoveries=0)
+        job = await fetched(pool, attempt.job.id)
+        assert (job.state, job.error) == ("canceled", None)
+        assert await entries(pool) == set()
+
+
+async def test_entry_under_delivery_stays_when_its_job_fails(conninfo: str) -> None:
+    async with open_pool(conninfo, max_size=4) as pool:
+        attempt = await claimed(pool)
+        assert await recover(pool, attempt, max_recoveries=0, keep_entry=True)
+        assert await entries(pool) == {attempt.job.slip}
