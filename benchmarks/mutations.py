@@ -77,12 +77,23 @@ SUBJECTS = {
             "workers/queue/jobs.py": ("get_job",),
             "workers/queue/storage_leases.py": (
                 "StorageLease",
+                "storage_lease",
+                "removal_transaction",
+                "mark_for_removal",
+                "unmark_for_removal",
                 "expire_stale_leases",
                 "_are_being_removed",
                 "_removal_count",
             ),
         },
-        ("tests/queue/test_queue_jobs.py", "tests/queue/test_queue_faults.py", "-k", "not later-tables"),
+        (
+            "tests/queue/test_claims_and_recoveries.py",
+            "tests/queue/test_lease_fences.py",
+            "tests/queue/test_queue_faults.py",
+            "tests/queue/test_queue_jobs.py",
+            "-k",
+            "not later-tables",
+        ),
     ),
     "reference": Subject(
         {"engine/trace/reference.py": ("trace_reference", "_hit_count")},
@@ -429,6 +440,13 @@ class MutationRun:
         return True
 
 
+def _is_in(mutant: Mutant, part: str) -> bool:
+    """Return whether a mutant is in a part of a file, FILE:FIRST-LAST or FILE:LINE."""
+    name, _, lines = part.partition(":")
+    first, _, last = lines.partition("-")
+    return mutant.path.endswith(f"/{name}") and int(first) <= mutant.line <= int(last or first)
+
+
 def main() -> None:
     """Run the mutants of one subject and print the survivors."""
     parser = argparse.ArgumentParser(
@@ -436,15 +454,17 @@ def main() -> None:
     )
     parser.add_argument("subject", choices=SUBJECTS)
     parser.add_argument("--list", action="store_true", help="print the mutants; run nothing")
-    parser.add_argument("--lines", help="only the mutants of FILE:FIRST-LAST, FILE by its last part")
+    parser.add_argument(
+        "--lines",
+        nargs="+",
+        metavar="FILE:FIRST-LAST",
+        help="only these mutants; FILE by its last part",
+    )
     arguments = parser.parse_args()
     subject = SUBJECTS[arguments.subject]
     mutants = [mutant for path, names in subject.functions.items() for mutant in mutants_of(path, names)]
     if arguments.lines:
-        name, _, lines = arguments.lines.partition(":")
-        first, _, last = lines.partition("-")
-        chosen = range(int(first), int(last or first) + 1)
-        mutants = [m for m in mutants if m.path.endswith(f"/{name}") and m.line in chosen]
+        mutants = [mutant for mutant in mutants if any(_is_in(mutant, part) for part in arguments.lines)]
     if arguments.list:
         for mutant in mutants:
             print(f"{mutant.path}:{mutant.line}: {mutant.text}")

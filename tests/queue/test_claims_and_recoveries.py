@@ -2,17 +2,20 @@
 
 import asyncio
 import logging
+import uuid
 from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from octasplat.workers.db.connections import Pool, open_pool
+from octasplat.workers.db.connections import Connection, Pool, open_pool
 from octasplat.workers.db.events_and_logs import list_job_events, list_log_lines
+from octasplat.workers.db.ids import new_id
 from octasplat.workers.db.rows import Job
 from octasplat.workers.queue import attempts
 from octasplat.workers.queue.attempts import Attempt, claim
 from octasplat.workers.queue.job_endings import recover_attempt
 from octasplat.workers.queue.jobs import cancel_job, get_job
+from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
 from octasplat.workers.queue.recovery import StalledAttempts, recover_stalled_jobs
 from tests.support.queue_jobs import SLIPS, claimed, fetched
 
@@ -143,6 +146,29 @@ async def test_recovery_logs_entries_that_were_lost(conninfo: str, caplog: pytes
         ]
 
 
+async def test_recovery_leaves_jobs_alone_that_went_on(
+    conninfo: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They had no entry when it looked, and are over, canceled or claimed when it has their locks."""
+    async with open_pool(conninfo, max_size=4) as pool:
+        running, canceled = await claimed(pool), await claimed(pool)
+        await canceled.requeue(SLIPS, "test")
+
+        async def orphaned(_queue: ProcrastinateQueue, _connection: Connection) -> list[uuid.UUID]:
+            return [running.job.id, new_id(), canceled.job.id]
+
+        monkeypatch.setattr(ProcrastinateQueue, "orphaned_jobs", orphaned)
+        async with pool.connection() as other, other.transaction():
+            assert await get_job(other, canceled.job.id, lock=True) is not None
+            recovery = asyncio.create_task(recover_stalled_jobs(pool, SLIPS, 5, StalledAttempts(0.0)))
+            await asyncio.sleep(0.3)
+            await other.execute("UPDATE jobs SET state = 'canceled' WHERE id = %s", [canceled.job.id])
+        assert await asyncio.wait_for(recovery, SOON_SECONDS) == 0
+        jobs = [await fetched(pool, attempt.job.id) for attempt in (running, canceled)]
+        assert [job.state for job in jobs] == ["running", "canceled"]
+        assert jobs[0].slip == running.job.slip
+
+
 async def test_attempts_are_stalled_only_while_they_do_not_change(conninfo: str) -> None:
     async with open_pool(conninfo, max_size=4) as pool:
         job = (await claimed(pool)).job
@@ -156,8 +182,9 @@ async def test_attempts_are_stalled_only_while_they_do_not_change(conninfo: str)
 
 async def test_recovered_attempt_is_written_down(conninfo: str) -> None:
     async with open_pool(conninfo, max_size=4) as pool:
-        attempt = await claimed(pool)
+        attempt, other = await claimed(pool), await claimed(pool)
         assert not await recover(pool, attempt, delay_seconds=3600.0)
+        assert (await fetched(pool, other.job.id)).rescues == 0
         job = await fetched(pool, attempt.job.id)
         assert (job.state, job.rescues, job.attempt) == ("queued", 1, 1)
         assert job.slip is not None and job.slip != attempt.job.slip
@@ -165,7 +192,7 @@ async def test_recovered_attempt_is_written_down(conninfo: str) -> None:
         assert (1, "Lost, and queued again: It is gone.") in await log_of(pool, job)
         assert job.waits_for == "It is gone."
         assert 3000 < await delay_of(pool, job) <= 3600
-        assert await entries(pool) == {job.slip}
+        assert await entries(pool) == {job.slip, other.job.slip}
 
 
 async def test_recovered_attempt_keeps_an_entry_under_delivery(conninfo: str) -> None:
