@@ -48,10 +48,13 @@ class Subject:
     Args:
         functions: module, relative to the root, -> names of its functions and classes; none means all.
         tests: arguments of pytest.
+        shares_fixtures: whether fixtures of the session are set up once, such as a database server, and not
+            for each mutant.
     """
 
     functions: dict[str, tuple[str, ...]]
     tests: tuple[str, ...]
+    shares_fixtures: bool = False
 
 
 SUBJECTS = {
@@ -94,6 +97,7 @@ SUBJECTS = {
             "-k",
             "not later-tables",
         ),
+        shares_fixtures=True,
     ),
     "reference": Subject(
         {"engine/trace/reference.py": ("trace_reference", "_hit_count")},
@@ -380,6 +384,8 @@ class MutationRun:
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
         """Run the tests and the mutants; print the survivors and the counts."""
         files = [ROOT / path for path in self._subject.functions]
+        if self._subject.shares_fixtures:
+            self._set_up_session(session.items)
         found = _in_fork(lambda: self._run_all(session.items, files))
         if found is None:
             sys.exit("The tests do not pass without a change.")
@@ -408,6 +414,12 @@ class MutationRun:
             print(f"{path}: {killed + survived} mutants, {killed} killed, {survived} survived")
         return True
 
+    def _set_up_session(self, items: Sequence[pytest.Item]) -> None:
+        """Run a test whose fixtures of the session stay for the forks: the next one is in another module."""
+        item = items[0]
+        after = next((other for other in items if other.path != item.path), items[-1])
+        item.config.hook.pytest_runtest_protocol(item=item, nextitem=after)
+
     def _run_all(
         self, items: Sequence[pytest.Item], files: Sequence[Path]
     ) -> tuple[dict[str, dict[int, list[str]]], dict[str, float]]:
@@ -417,7 +429,7 @@ class MutationRun:
         watch = coverage.Coverage(data_file=None, config_file=False, include=[str(file) for file in files])
         seconds = {}
         watch.start()
-        for item, after in zip(items, [*items[1:], None], strict=True):
+        for item, after in zip(items, self._following(items), strict=True):
             watch.switch_context(item.nodeid)
             for file in files:  # else a cached function is reached by the first test alone
                 _clear_caches(file)
@@ -430,12 +442,17 @@ class MutationRun:
         data = watch.get_data()
         return {str(file.relative_to(ROOT)): data.contexts_by_lineno(str(file)) for file in files}, seconds
 
+    def _following(self, items: Sequence[pytest.Item]) -> list[pytest.Item | None]:
+        """Return the test after each; after the last one another, if fixtures of the session are to stay."""
+        return [*items[1:], items[0] if self._subject.shares_fixtures else None]
+
     def _pass(self, items: Sequence[pytest.Item]) -> bool:
         """Return whether tests pass; ends at the first that does not."""
-        for item, after in zip(items, [*items[1:], None], strict=True):
+        for item, after in zip(items, self._following(items), strict=True):
             item.config.hook.pytest_runtest_protocol(item=item, nextitem=after)
             if self._has_failed:
-                items[0].session._setupstate.teardown_exact(None)  # what fixtures started is stopped
+                if not self._subject.shares_fixtures:
+                    items[0].session._setupstate.teardown_exact(None)  # what fixtures started is stopped
                 return False
         return True
 

@@ -73,7 +73,7 @@ def source_digest(module: str) -> str:
 
 
 def _is_usable(folder: Path) -> bool:
-    """Whether this process may keep code in ``folder``, and nobody else but root may."""
+    """Return whether this process, and nobody else but root, may keep code in ``folder``."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):

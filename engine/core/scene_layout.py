@@ -52,7 +52,7 @@ _SHOWN_NAMES = 3
 
 
 class FileRole(Enum):
-    """What a file is in a scene."""
+    """Role of a file in a dataset."""
 
     IMAGE = "image"
     MASK = "mask"
@@ -62,7 +62,7 @@ class FileRole(Enum):
 
 @dataclass(frozen=True)
 class SceneLayout:
-    """What of some files belongs to a scene.
+    """Files that belong to a dataset, among others.
 
     Attributes:
         files: the path of each file of the scene by its name in the scene, e.g. ``images/a.jpg``.

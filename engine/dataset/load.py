@@ -1,6 +1,6 @@
 """Matching of a COLMAP model with the photographs and masks on disk."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
@@ -56,19 +56,7 @@ def load_dataset_model(
     """
     if max_side is not None and max_side < 1:
         raise ConfigError(f"max_side is {max_side}; it must be at least 1 pixel.")
-    if not root.is_dir():
-        raise DatasetError(f"{root} is not a folder; name the folder that holds images/ and sparse/.")
-    if (
-        model_folder is None
-        and image_folder(root) == root
-        and not (photographs_below(root) and has_model(root))
-    ):
-        if any(is_photograph(path.name) for path in root.iterdir()):
-            raise DatasetError(
-                f"{root} is a bare folder of photographs, without camera poses; have them found: octasplat "
-                "reconstruct with --poses auto, or octasplat submit."
-            )
-        raise DatasetError(f"{root} has no folder images; put the photographs into {root / 'images'}.")
+    _check_root(root, has_found_model=model_folder is not None)
     source = model_folder or find_model(root, model)
     found = read_colmap_model(source, origin_world=origin_world)
     if len(found.images) < min_views:
@@ -85,51 +73,28 @@ def load_dataset_model(
     if for_training and len(found.points) == 0:
         warnings.append(f"The model in {found.folder} has no 3D points; the start will be random.")
     located = _find_images(image_folder(root), found, warnings, warn_unposed=model_folder is None)
-    images, paths = located.images, located.paths
     masks = _mask_paths(root, located, warnings)
     if model_folder is None:
         _warn_of_other_models(root, found.folder, warnings)
 
-    views: list[DatasetView] = []
-    infos: list[ImageInfo] = []
-    observed_px: list[Float64[np.ndarray, "k 2"]] = []
-    camera_indices: dict[Camera, int] = {}
-    for image, path, mask in zip(images, paths, masks, strict=True):
-        info = read_image_info(path)
-        original = found.cameras[image.camera_id]
-        _check_size(original, info, image, path)
-        width, height = capped_size(info.width_px, info.height_px, max_side)
-        camera = original.scaled_to(width, height)
-        observed_px.append(image.observed_px * (width / original.width_px, height / original.height_px))
-        views.append(
-            DatasetView(
-                name=image.name,
-                image_path=path,
-                mask_path=mask,
-                camera_index=camera_indices.setdefault(camera, len(camera_indices)),
-                rotation_cam_from_world=image.rotation_cam_from_world,
-                translation_cam_from_world=image.translation_cam_from_world,
-                width_px=width,
-                height_px=height,
+    return _model_of_views(root, found, located, masks, max_side, warnings)
+
+
+def _check_root(root: Path, *, has_found_model: bool) -> None:
+    """Refuse a folder without photographs, or without poses unless a model was found for it."""
+    if not root.is_dir():
+        raise DatasetError(f"{root} is not a folder; name the folder that holds images/ and sparse/.")
+    if (
+        not has_found_model
+        and image_folder(root) == root
+        and not (photographs_below(root) and has_model(root))
+    ):
+        if any(is_photograph(path.name) for path in root.iterdir()):
+            raise DatasetError(
+                f"{root} is a bare folder of photographs, without camera poses; have them found: octasplat "
+                "reconstruct with --poses auto, or octasplat submit."
             )
-        )
-        infos.append(info)
-    return DatasetModel(
-        views=tuple(views),
-        cameras=tuple(camera_indices),
-        root=root,
-        model_folder=found.folder,
-        image_infos=tuple(infos),
-        points=found.points,
-        observations=Observations(
-            np.repeat(np.arange(len(views)), [len(observed) for observed in observed_px]),
-            np.concatenate([image.observed_point_ids for image in images]),
-            np.concatenate(observed_px),
-        ),
-        warnings=tuple(warnings),
-        origin_world=found.origin_world,
-        held_out=None if found.held_out is None else tuple(map(located.file_name, found.held_out)),
-    )
+        raise DatasetError(f"{root} has no folder images; put the photographs into {root / 'images'}.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,3 +223,55 @@ def _warn_of_other_models(root: Path, taken: Path, warnings: list[str]) -> None:
 
 def _name_list(names: list[str]) -> str:
     return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+
+
+def _model_of_views(
+    root: Path,
+    found: ColmapModel,
+    located: _LocatedImages,
+    masks: Sequence[Path | None],
+    max_side: int | None,
+    warnings: list[str],
+) -> DatasetModel:
+    """Return the model of the photographs that were found, of the sizes that ``max_side`` caps."""
+    images = located.images
+    views: list[DatasetView] = []
+    infos: list[ImageInfo] = []
+    observed_px: list[Float64[np.ndarray, "k 2"]] = []
+    camera_indices: dict[Camera, int] = {}
+    for image, path, mask in zip(images, located.paths, masks, strict=True):
+        info = read_image_info(path)
+        original = found.cameras[image.camera_id]
+        _check_size(original, info, image, path)
+        width, height = capped_size(info.width_px, info.height_px, max_side)
+        camera = original.scaled_to(width, height)
+        observed_px.append(image.observed_px * (width / original.width_px, height / original.height_px))
+        views.append(
+            DatasetView(
+                name=image.name,
+                image_path=path,
+                mask_path=mask,
+                camera_index=camera_indices.setdefault(camera, len(camera_indices)),
+                rotation_cam_from_world=image.rotation_cam_from_world,
+                translation_cam_from_world=image.translation_cam_from_world,
+                width_px=width,
+                height_px=height,
+            )
+        )
+        infos.append(info)
+    return DatasetModel(
+        views=tuple(views),
+        cameras=tuple(camera_indices),
+        root=root,
+        model_folder=found.folder,
+        image_infos=tuple(infos),
+        points=found.points,
+        observations=Observations(
+            np.repeat(np.arange(len(views)), [len(observed) for observed in observed_px]),
+            np.concatenate([image.observed_point_ids for image in images]),
+            np.concatenate(observed_px),
+        ),
+        warnings=tuple(warnings),
+        origin_world=found.origin_world,
+        held_out=None if found.held_out is None else tuple(map(located.file_name, found.held_out)),
+    )

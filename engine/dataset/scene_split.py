@@ -16,7 +16,7 @@ SplitSource = Literal["given", "every"]
 
 @dataclass(frozen=True)
 class SplitRule:
-    """How views are held out.
+    """Rule that chooses the held-out views.
 
     Attributes:
         test_every: hold out every N-th view, starting with the first; 0 holds out none.

@@ -84,7 +84,7 @@ _LENS_KEYS = tuple(_Lens.model_fields)
 
 @dataclass(frozen=True)
 class TransformsModel:
-    """What the files say.
+    """Cameras and poses of transforms files.
 
     Attributes:
         records: cameras, photographs, and points if a file names some.

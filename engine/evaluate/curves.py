@@ -81,7 +81,7 @@ MIN_TIME_RANGE_SECONDS = 3.0
 
 @dataclass(frozen=True)
 class _ChartSource:
-    """What a chart shows; ``y_from_zero`` begins the vertical axis at exactly 0."""
+    """Series of a chart; ``y_from_zero`` begins the vertical axis at exactly 0."""
 
     title: str
     unit: str

@@ -85,16 +85,12 @@ def evaluate_held_out(
         warnings = _as_warnings(check.warn_of_cameras(dataset.viewpoints, gaussians), progress)
     rows: list[ViewMetrics] = []
     images = WorstAndBestViews()
-    total = len(dataset.test_indices)
     photographs = [view.name for view in dataset.views]
     names = dict(zip(photographs, unique_render_names(photographs), strict=True))
     for view, measured in _measure_views(
         _render_views(dataset, tracer, shading, background, measures), threads or numba.get_num_threads()
     ):
-        write_png(output / RENDERS / f"{names[view.name]}.png", view.render)
-        if ALBEDO in view.layers:
-            for layer, display in view.layers.items():
-                write_png(output / LAYERS / layer / f"{names[view.name]}.png", display)
+        _write_images(view, output, names[view.name])
         rows.append(measured.metrics)
         if check is not None:
             check.add(view, measured.metrics.psnr)
@@ -103,7 +99,7 @@ def evaluate_held_out(
             measured.metrics.psnr,
             ViewImages(view.reference, view.render, measured.flip_map, view.layers),
         )
-        progress(PhaseProgress("evaluate", len(rows), total))
+        progress(PhaseProgress("evaluate", len(rows), len(dataset.test_indices)))
     if check is not None and not warnings:
         warnings = _as_warnings(check.warn_of_renders(), progress)
     if measures is not None and environment is not None:
@@ -125,6 +121,13 @@ def evaluate_held_out(
         environment_linear=None if environment is None else environment.radiance_linear,
         background_srgb=None if behind is None else behind.rgb_srgb,
     )
+
+
+def _write_images(view: RenderedView, output: Path, name: str) -> None:
+    write_png(output / RENDERS / f"{name}.png", view.render)
+    if ALBEDO in view.layers:
+        for layer, display in view.layers.items():
+            write_png(output / LAYERS / layer / f"{name}.png", display)
 
 
 def _as_warnings(message: str | None, progress: EventListener) -> list[Warned]:

@@ -1,6 +1,6 @@
 """Surfaces as binary glTF: normals, and a texture, materials or the colors of the vertices."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -75,22 +75,7 @@ def write_surface(
         document |= {"textures": data.textures, "samplers": [SAMPLER], "images": data.images}
     elif mesh.rgb_srgb is not None:
         attributes["COLOR_0"] = srgb_to_linear(mesh.rgb_srgb)
-    accessors: list[dict[str, object]] = []
-    used: dict[str, int] = {}
-    for semantic, values in attributes.items():
-        view = data.add(np.ascontiguousarray(values, "<f4").tobytes(), glb_container.ARRAY_BUFFER)
-        used[semantic] = len(accessors)
-        accessors.append(
-            glb_container.accessor_json(
-                view, glb_container.FLOAT, len(values), glb_container.vector_type(values.shape[1])
-            )
-        )
-    accessors[0] |= {
-        "min": mesh.vertices_world.min(axis=0).tolist(),
-        "max": mesh.vertices_world.max(axis=0).tolist(),
-    }
-    view = data.add(mesh.faces.astype("<u4").tobytes(), glb_container.ELEMENT_ARRAY_BUFFER)
-    accessors.append(glb_container.accessor_json(view, glb_container.UNSIGNED_INT, mesh.faces.size, "SCALAR"))
+    used, accessors = _add_accessors(mesh, attributes, data)
     document |= {
         "meshes": [
             {
@@ -146,3 +131,30 @@ class _SurfaceData:
         self.images.append({"name": name, "mimeType": "image/png", "bufferView": view})
         self.textures.append({"sampler": 0, "source": len(self.images) - 1})
         return {"index": len(self.textures) - 1}
+
+
+def _add_accessors(
+    mesh: TriangleMesh, attributes: Mapping[str, np.ndarray], data: _SurfaceData
+) -> tuple[dict[str, int], list[dict[str, object]]]:
+    """Add the vertices' attributes and then the faces to ``data``.
+
+    Returns:
+        The number of the accessor of each attribute, and the accessors; the last one is that of the faces.
+    """
+    accessors: list[dict[str, object]] = []
+    used: dict[str, int] = {}
+    for semantic, values in attributes.items():
+        view = data.add(np.ascontiguousarray(values, "<f4").tobytes(), glb_container.ARRAY_BUFFER)
+        used[semantic] = len(accessors)
+        accessors.append(
+            glb_container.accessor_json(
+                view, glb_container.FLOAT, len(values), glb_container.vector_type(values.shape[1])
+            )
+        )
+    accessors[0] |= {
+        "min": mesh.vertices_world.min(axis=0).tolist(),
+        "max": mesh.vertices_world.max(axis=0).tolist(),
+    }
+    view = data.add(mesh.faces.astype("<u4").tobytes(), glb_container.ELEMENT_ARRAY_BUFFER)
+    accessors.append(glb_container.accessor_json(view, glb_container.UNSIGNED_INT, mesh.faces.size, "SCALAR"))
+    return used, accessors

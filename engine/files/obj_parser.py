@@ -23,7 +23,7 @@ _INDENT = re.compile(rb"^[ \t]+", re.MULTILINE)
 
 @dataclass
 class ObjParts:
-    """What was read of a file so far, block by block."""
+    """Parts of a file that were read so far, block by block."""
 
     positions: list[np.ndarray] = field(default_factory=list)
     uv: list[np.ndarray] = field(default_factory=list)

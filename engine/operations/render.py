@@ -165,7 +165,7 @@ class RenderResult(Result):
 
 
 class _RenderPlan(NamedTuple):
-    """What is rendered of what, and where to; ``cameras`` None stands for views of the photographs."""
+    """Source, cameras and output of a render; ``cameras`` None stands for views of the photographs."""
 
     request: RenderRequest
     source: "RenderSource"

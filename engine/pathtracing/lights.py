@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
@@ -49,6 +50,32 @@ class EmissiveMesh:
     texture: int = -1
 
 
+class _MeshTables(NamedTuple):
+    """Triangles of all emissive meshes, and the areas before each as shares of its mesh.
+
+    ``rows`` has the first and last row of each mesh in ``cdf``, and its first triangle.
+    """
+
+    rows: Int64[np.ndarray, "m 3"]
+    cdf: Float64[np.ndarray, " c"]
+    corners_world: Float32[np.ndarray, "f 3 3"]
+    uv: Float32[np.ndarray, "f 3 2"]
+
+
+def _mesh_tables(meshes: Sequence[EmissiveMesh]) -> _MeshTables:
+    rows, sums = np.zeros((len(meshes), 3), np.int64), [np.zeros(0)]
+    corners, uv = [np.zeros((0, 3, 3), np.float32)], [np.zeros((0, 3, 2), np.float32)]
+    face, row = 0, 0
+    for m, mesh in enumerate(meshes):
+        own = triangle_areas(mesh.corners_world)
+        rows[m] = row, row + len(own), face
+        sums.append(np.concatenate([[0.0], np.cumsum(own) / own.sum()]))
+        corners.append(mesh.corners_world)
+        uv.append(mesh.corner_uv)
+        face, row = face + len(own), row + len(own) + 1
+    return _MeshTables(rows, np.concatenate(sums), np.concatenate(corners), np.concatenate(uv))
+
+
 def build_light_arrays(
     lights: tuple[Light, ...],
     up_world: Float64[np.ndarray, "3"],
@@ -67,6 +94,7 @@ def build_light_arrays(
         texels_linear: of the textures of the meshes' light.
         texture_sizes: likewise.
     """
+    tables = _mesh_tables(meshes)
     count = len(lights) + len(meshes) + (environment is not None)
     kinds, visibility, adds = np.zeros((3, count), np.int32)
     positions, axes, rgb, sides_u, sides_v = np.zeros((5, count, 3))
@@ -93,17 +121,11 @@ def build_light_arrays(
             kinds[l], rgb[l], visibility[l] = RECTANGLE, color * light.radiance, light.visible
             sides_u[l], sides_v[l] = rectangle_sides(light, up_world)
             areas[l] = light.width * light.height
-    sums, corners, uv = [], [np.zeros((0, 3, 3), np.float32)], [np.zeros((0, 3, 2), np.float32)]
-    face, row = 0, 0
     for l, mesh in enumerate(meshes, len(lights)):
         own = triangle_areas(mesh.corners_world)
         kinds[l], rgb[l], areas[l], visibility[l], adds[l] = MESH, mesh.rgb_linear, own.sum(), 1, 1
         positions[l] = own @ mesh.corners_world.mean(axis=1, dtype=np.float64) / own.sum()
-        textures[l], rows[l] = mesh.texture, (row, row + len(own), face)
-        sums.append(np.concatenate([[0.0], np.cumsum(own) / own.sum()]))
-        corners.append(mesh.corners_world)
-        uv.append(mesh.corner_uv)
-        face, row = face + len(own), row + len(own) + 1
+        textures[l], rows[l] = mesh.texture, tables.rows[l - len(lights)]
     radiance, frame = np.zeros((1, 1, 3), np.float32), np.eye(3)
     if environment is not None:
         radiance, frame = environment.radiance_linear, environment.frame
@@ -123,9 +145,9 @@ def build_light_arrays(
         any_adds_light=bool(adds.any()),
         textures=textures,
         mesh_rows=rows,
-        mesh_cdf=np.concatenate([np.zeros(0), *sums]),
-        mesh_corners_world=np.concatenate(corners),
-        mesh_uv=np.concatenate(uv),
+        mesh_cdf=tables.cdf,
+        mesh_corners_world=tables.corners_world,
+        mesh_uv=tables.uv,
         texels_linear=np.zeros((0, 3), np.float32) if texels_linear is None else texels_linear,
         texture_sizes=np.zeros((0, 3), np.int64) if texture_sizes is None else texture_sizes,
         environment_linear=radiance,

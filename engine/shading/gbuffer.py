@@ -18,7 +18,7 @@ MIN_ALPHA = 0.02
 
 
 class RayOffset(NamedTuple):
-    """How rays leave a surface of Gaussians.
+    """Offsets with which rays leave a surface of Gaussians.
 
     Attributes:
         bias_world: distance from it at which they begin.
@@ -31,7 +31,7 @@ class RayOffset(NamedTuple):
 
 @dataclass(frozen=True)
 class GBuffer:
-    """What was blended along the rays that hit something.
+    """Depths, normals and materials blended along the rays that hit something.
 
     Attributes:
         ray_ids: numbers of these rays.

@@ -24,7 +24,7 @@ Recipe = Literal["split_sum", "ref_gaussian"]
 
 
 class MaterialSettings(Settings):
-    """How materials and an environment are learnt; shares of the training are of all its iterations."""
+    """Settings of learnt materials and environments; shares of the training are of all its iterations."""
 
     former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.MATERIALS
 

@@ -93,7 +93,7 @@ class ShadingGradients:
 
 @dataclass(frozen=True)
 class ShadingStep:
-    """What one step of the optimiser goes by.
+    """Gaussians, gradients and progress that one step of the optimiser goes by.
 
     Attributes:
         gaussians: those traced, after their own step.

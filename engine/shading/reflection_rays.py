@@ -69,7 +69,7 @@ def direction_uniforms(directions: Float64[np.ndarray, "p 3"], salt: int) -> Flo
 
 @dataclass(frozen=True)
 class ReflectionRayPairs:
-    """What the lobes of a buffer's points see.
+    """Reflected rays of a buffer's points in pairs, one on either side of each lobe.
 
     Attributes:
         facets: that the two rays of each point were mirrored at.
@@ -86,7 +86,7 @@ class ReflectionRayPairs:
 
 
 class RoughnessProbe(NamedTuple):
-    """What changes as lobes widen, at ``w`` of the points of a buffer.
+    """Probe of the change of radiance as lobes widen, at ``w`` of the points of a buffer.
 
     Attributes:
         point_ids: their numbers.

@@ -26,7 +26,7 @@ from octasplat.engine.trace.protocol import Recording, TraceGradients, Tracer, T
 
 
 class IncidentLight(NamedTuple):
-    """What a reflected ray saw, ``s`` of them.
+    """Visibility and incident radiance along ``s`` reflected rays.
 
     Attributes:
         visibility: share of the environment that is seen past everything.

@@ -49,7 +49,7 @@ def split_sum_table() -> Float64[np.ndarray, "a c 2"]:
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """What is shaded, ``p`` points of it.
+    """Inputs of the shading of ``p`` points.
 
     Attributes:
         material: albedo (linear), metallic, perceptual roughness.

@@ -94,25 +94,17 @@ def extract_levels(
     report = stop_when_asked(listener, should_stop, "Stopped; no surface was written.")
     if not options.unbounded and options.bounds is None:
         focus_point(cameras)  # complain before the long work
-    with counted_phase("depth", report, len(cameras)) as progress:
-        maps, renders = render_depth_maps(tracer, cameras, options, scratch, progress)
+    volume, region, renders = _fuse_scene(tracer, cameras, options, scratch, report)
     photographs = renders if photographs is None else photographs
-    region = choose_region(maps, options)
-    with counted_phase("fusing", report, 2 * len(cameras)) as progress:
-        volume: TsdfVolume | None = fuse_depth_maps(maps, region, options, progress)
-    del maps
-    assert volume is not None
-    if options.unseen == "solid":
-        fill_unseen(volume, options.min_weight)
     volume_bytes = len(volume.blocks) * BYTES_PER_BLOCK
     with counted_phase("meshing", report, 3) as progress:
         mesh = marching_cubes(volume, options.min_weight)
-        volume, found = None, len(mesh.faces)
+        del volume
+        found = len(mesh.faces)
         progress(1, 3)
         mesh = _keep_components(mesh, options)
         progress(2, 3)
-        max_rim = None if options.fill_holes == "all" else options.fill_holes * region.voxel_world
-        mesh, closed = fill_holes(mesh, max_rim) if max_rim is None or max_rim > 0 else (mesh, 0)
+        mesh, closed = _close_holes(mesh, options, region)
         progress(3, 3)
     if options.refine_vertices:  # while triangles are small enough to show what the pictures do
         with counted_phase("settling", report, 0) as progress:
@@ -120,11 +112,12 @@ def extract_levels(
     meshes = _decimate_levels(mesh, options, levels, report)
     del mesh
     result = []
+    centre = np.mean([camera.centre_world for camera in cameras], axis=0)
     for mesh in meshes:
         edges = edge_report(mesh.faces)
         if options.backdrop:
-            mesh = with_backdrop(mesh, np.mean([camera.centre_world for camera in cameras], axis=0))
-        colored = _bake_colors(
+            mesh = with_backdrop(mesh, centre)
+        mesh = _bake_colors(
             tracer=tracer,
             cameras=cameras,
             renders=renders,
@@ -135,17 +128,32 @@ def extract_levels(
             light_frame=light_frame,
             report=report,
         )
-        result.append(
-            ExtractedSurface(
-                mesh=colored,
-                region=region,
-                volume_bytes=volume_bytes,
-                triangles_found=found,
-                holes_closed=closed,
-                edges=edges,
-            )
-        )
+        result.append(ExtractedSurface(mesh, region, volume_bytes, found, closed, edges))
     return tuple(result)
+
+
+def _fuse_scene(
+    tracer: Tracer,
+    cameras: Sequence[PinholeCamera],
+    options: ExtractionOptions,
+    scratch: Path,
+    report: EventListener,
+) -> tuple[TsdfVolume, Region, tuple[Picture, ...]]:
+    """Return the fused depth maps, the region that they fill, and what the cameras see."""
+    with counted_phase("depth", report, len(cameras)) as progress:
+        maps, renders = render_depth_maps(tracer, cameras, options, scratch, progress)
+    region = choose_region(maps, options)
+    with counted_phase("fusing", report, 2 * len(cameras)) as progress:
+        volume = fuse_depth_maps(maps, region, options, progress)
+    del maps
+    if options.unseen == "solid":
+        fill_unseen(volume, options.min_weight)
+    return volume, region, renders
+
+
+def _close_holes(mesh: TriangleMesh, options: ExtractionOptions, region: Region) -> tuple[TriangleMesh, int]:
+    max_rim = None if options.fill_holes == "all" else options.fill_holes * region.voxel_world
+    return fill_holes(mesh, max_rim) if max_rim is None or max_rim > 0 else (mesh, 0)
 
 
 def _bake_colors(

@@ -155,12 +155,7 @@ def trace_reference(
         alphas = alpha[ray, ids]
         transmittance = torch.cat([alphas.new_ones(1), torch.cumprod(1 - alphas, 0)])
         weight = alphas * transmittance[:-1]  # alpha_k T_k
-        # The direction from the viewer to the mean, the ray's own from infinitely far away.
-        view = d[ray].expand(len(ids), 3)
-        if t_viewers[ray].isfinite():
-            view = to_mean[ray, ids] - t_viewers[ray] * view
-        basis = sh_basis(view / view.norm(dim=-1, keepdim=True), p.sh.shape[1])
-        color = torch.clamp(0.5 + torch.einsum("nk,nkc->nc", basis, p.sh[ids]), min=0)
+        color = _colors(p.sh[ids], to_mean[ray, ids], d[ray], t_viewers[ray])
         to_means = to_mean[ray, ids].detach()
         cosine_to_mean = (to_means * r1[ids].detach()).sum(-1) / to_means.norm(dim=-1)
         facing = torch.where(cosine_to_mean > settings.flip_normal_cos, -1.0, 1.0)
@@ -188,6 +183,18 @@ def trace_reference(
         features=extra,
         hit_ids=hit_ids,
     )
+
+
+def _colors(sh: Tensor, to_mean: Tensor, direction: Tensor, t_viewer: Tensor) -> Tensor:
+    """Return the colors (n, 3) of the hits of a ray, along the direction from the viewer to each mean.
+
+    Seen from infinitely far away, that is the ray's own direction.
+    """
+    view = direction.expand(len(sh), 3)
+    if t_viewer.isfinite():
+        view = to_mean - t_viewer * view
+    basis = sh_basis(view / view.norm(dim=-1, keepdim=True), sh.shape[1])
+    return torch.clamp(0.5 + torch.einsum("nk,nkc->nc", basis, sh), min=0)
 
 
 def _hit_count(alphas: Tensor, settings: TraceSettings) -> int:

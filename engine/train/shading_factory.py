@@ -15,7 +15,7 @@ from octasplat.engine.train.config import BACKGROUND_SMOOTHNESS, TrainConfig
 
 @dataclass(frozen=True)
 class ShadingOptions:
-    """What a shading model learns, and how fast.
+    """Materials that a shading model learns, and its learning rates.
 
     Attributes:
         materials: how materials and light are learnt; None where they are not.

@@ -34,7 +34,7 @@ class PreviewedFile:
 
 @dataclass(frozen=True)
 class ScenePreview:
-    """What of a folder or an archive would be taken.
+    """Files of a folder or an archive that would be taken.
 
     Attributes:
         files: what is taken, by name.

@@ -49,7 +49,7 @@ class RefusalView(BaseModel):
 
 
 class ScenePreviewView(BaseModel):
-    """What would be taken of a folder or an archive."""
+    """The files that would be taken of a folder or an archive."""
 
     files: list[PreviewedFileView]
     left_out: list[str] = Field(description="Files that are no part of a scene.")

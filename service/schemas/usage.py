@@ -4,14 +4,14 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class UsedView(BaseModel):
-    """What is used of something that has a limit."""
+    """Use of something that has a limit."""
 
     used: int
     limit: int | None = Field(description="How much there may be; null is any number.")
 
 
 class UsageView(BaseModel):
-    """What an owner takes and may take; all tokens of an owner share it."""
+    """Use and limits of an owner; all tokens of an owner share it."""
 
     model_config = ConfigDict(
         json_schema_extra={

@@ -171,7 +171,7 @@ class DeliveryList(BaseModel):
 
 
 class JobEventData(BaseModel):
-    """Which job a message is about."""
+    """The job that a message is about."""
 
     job_id: uuid.UUID
     kind: str = Field(description="Of the job, such as reconstruct.")
@@ -191,7 +191,7 @@ class JobEventMessage(BaseModel):
 
 
 class TestMessageData(BaseModel):
-    """Which webhook a test is about."""
+    """The webhook that a test is about."""
 
     webhook_id: uuid.UUID
 

@@ -151,7 +151,7 @@ def viewer_cameras(
 
 @dataclass(frozen=True)
 class _Intrinsics:
-    """What the viewer needs of a camera's intrinsics."""
+    """Intrinsics of a camera as the viewer takes them."""
 
     fov_y_degrees: float
     aspect: float

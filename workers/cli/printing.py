@@ -16,7 +16,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 @dataclass(frozen=True)
 class Printer:
-    """How a command prints what came of it.
+    """Prints the outcome of a command as text or JSON.
 
     Attributes:
         as_json: one JSON value on standard output, and nothing else there.

@@ -59,7 +59,7 @@ async def list_datasets(
 
 @dataclass(frozen=True)
 class DatasetSize:
-    """What a dataset takes: the bytes of its files, and the jobs that work on it."""
+    """Size of a dataset: the bytes of its files, and the jobs that work on it."""
 
     id: uuid.UUID
     bytes: int

@@ -81,7 +81,7 @@ class BackupSummary:
 
 @dataclass(frozen=True)
 class _Copied:
-    """What was copied: count and total length of the contents, and what is wrong with others by digest."""
+    """Copied contents: their count and total length, and what is wrong with others by digest."""
 
     contents: int
     size_bytes: int

@@ -337,7 +337,7 @@ async def claim(pool: Pool, job_id: uuid.UUID, entry_id: int, worker: str) -> At
         await connection.execute(
             """
             UPDATE jobs SET state = 'running', attempt = attempt + 1, worker = %s, started_at = now(),
-                heartbeat_at = now(), stage = NULL, step = NULL, total_steps = NULL, seconds_left = NULL
+                heartbeat_at = now(), stage = NULL, step = NULL, total_steps = NULL
             WHERE id = %s
             """,
             [worker, job_id],

@@ -38,7 +38,7 @@ MAX_DISTANCE = 50.0
 
 @dataclass(frozen=True)
 class InitialGaussianOptions:
-    """How many Gaussians a training begins with, and how they are placed.
+    """Number and placement of the Gaussians that a training begins with.
 
     Attributes:
         seed: of everything random.

@@ -52,7 +52,7 @@ class PlaneSweepPoints:
 
 @dataclass(frozen=True, eq=False)
 class MatchEvidence:
-    """What tells whether to believe points: whose pixels they were, and how clearly these matched.
+    """Evidence for points: whose pixels they were, and how clearly these matched.
 
     ``view`` is one of the dataset's, and ``distance`` that to its camera. Of swept depths, ``rivalry`` is the
     cost over that of the best other more than one step away: near 0 where only one depth matches.

@@ -159,7 +159,7 @@ def load_latest_checkpoint(folder: Path, fingerprint: str, progress: EventListen
 
 @dataclass(frozen=True)
 class BestState:
-    """What did best so far.
+    """The state that did best so far.
 
     Attributes:
         gaussians: the Gaussians.

@@ -28,7 +28,7 @@ EARLY_STOPPING_TAIL = 0.2
 
 @dataclass(frozen=True)
 class Schedule:
-    """What is due before and after each iteration; iterations are counted from 1, 0 is the start.
+    """Work that is due before and after each iteration; iterations are counted from 1, 0 is the start.
 
     A run may stop, and goes on, only where its hierarchy is built anew in any case: so a resumed run traces
     the same boxes as one that was never stopped.

@@ -36,7 +36,7 @@ MIN_ITERATIONS, MIN_GAUSSIANS = 100, 2_000
 
 
 class TimeBudgetPlan(BaseModel):
-    """What was chosen, and from what.
+    """Plan that fits a time, and the measurements it was made from.
 
     Attributes:
         iterations: of the training.

@@ -59,7 +59,7 @@ class Batch:
 
 @dataclass(frozen=True)
 class BatchOptions:
-    """How batches are drawn.
+    """Options of the drawing of batches.
 
     Attributes:
         rays_per_batch: number of rays of a batch.

@@ -19,7 +19,7 @@ VALID_PIXEL_SAMPLES = 20_000
 
 @runtime_checkable
 class PixelSource(Protocol):
-    """What training needs of a dataset (see :class:`octasplat.engine.dataset.Dataset`)."""
+    """Interface of a dataset that training needs (see :class:`octasplat.engine.dataset.Dataset`)."""
 
     def rays(
         self, view: Int64[np.ndarray, " r"], y: Int64[np.ndarray, " r"], x: Int64[np.ndarray, " r"]

@@ -77,7 +77,7 @@ class RenderedPoints:
 
 @dataclass(frozen=True, eq=False)
 class PhotographSamples:
-    """What a photograph shows at image points.
+    """Colors and gradients of a photograph at image points.
 
     Attributes:
         rgb_srgb: display colors; 0 where it shows nothing.

@@ -42,7 +42,7 @@ MAX_MISPLACED_VIEWS, MAX_MISPLACED_FRACTION = 20, 0.25
 
 @dataclass(frozen=True, eq=False)
 class ViewPsnr:
-    """How well views are rendered, each on a fixed grid of its pixels.
+    """PSNR of views, each on a fixed grid of its pixels.
 
     Attributes:
         indices: the views.
@@ -172,7 +172,7 @@ def _squared_distances(
 
 @dataclass(frozen=True)
 class TrainingViewReport:
-    """How the training ended for its views, see :class:`ViewPsnr`.
+    """PSNR of the training views at the end, see :class:`ViewPsnr`.
 
     Attributes:
         psnr: dB, by name, of the views that were trained on to the end.
