@@ -15,7 +15,7 @@ from starlette.exceptions import HTTPException
 
 from octasplat.engine.core.errors import OctasplatError
 from octasplat.engine.operations.base import error_text
-from octasplat.engine.pathtracing.stage.stage_file import stage_error_message, stage_key_path
+from octasplat.engine.pathtracing.stage.stage_errors import stage_error
 from octasplat.engine.settings.refusals import InvalidSettingsError
 from octasplat.service.intake.faults import IntakeError
 from octasplat.service.request_id import current_request_id
@@ -142,7 +142,9 @@ def options_error(error: ValidationError | InvalidSettingsError, prefix: str = "
         "options",
         f"{error.error_count()} of the options cannot be used; see errors, and GET /v1/options."
         + _unlisted(error.error_count()),
-        errors=[_field_error(prefix, fault) for fault in error.errors(include_url=False)[:MAX_ERRORS]],
+        errors=_distinct(
+            _field_error(prefix, fault) for fault in error.errors(include_url=False)[:MAX_ERRORS]
+        ),
     )
 
 
@@ -264,10 +266,17 @@ def _unlisted(count: int) -> str:
     return f" {count - MAX_ERRORS} more are not listed." if count > MAX_ERRORS else ""
 
 
+def _distinct(faults: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return faults without those of which an earlier one says the same, as of the parts of a union."""
+    found: dict[tuple[str, str], dict[str, Any]] = {}
+    for fault in faults:
+        found.setdefault((fault["detail"], str(fault.get("pointer"))), fault)
+    return list(found.values())
+
+
 def _field_error(prefix: str, fault: Mapping[str, Any]) -> dict[str, Any]:
     if fault["loc"][:1] == ("stage",):  # told as whoever reads a stage file would be told
-        keys = ("stage", *stage_key_path(fault["loc"][1:]))
-        message = stage_error_message(fault["type"], keys, fault["msg"], fault.get("input"))
+        keys, message = stage_error({**fault, "loc": fault["loc"][1:]}, ("stage",))
         fault = {**fault, "loc": keys, "msg": message}
     where, *path = fault["loc"] or ("",)
     if prefix:

@@ -11,7 +11,7 @@ from octasplat.engine.core.events import EventListener, Warned, ignore_events
 from octasplat.engine.operations.base import Operation, Result, never_stop
 from octasplat.engine.operations.render_options import PictureOptions, PictureRequest, check_layers
 from octasplat.engine.pathtracing.stage.model import Stage
-from octasplat.engine.pathtracing.stage.stage_file import read_stage, referenced_files
+from octasplat.engine.pathtracing.stage.stage_file import read_stage, referenced_files, toml_complaint
 from octasplat.engine.pathtracing.stage.text_bounds import check_stage_text
 from octasplat.engine.settings.fields import ADVANCED, ReadPath, Spelling
 
@@ -40,7 +40,7 @@ def parse_stage_text(value: object) -> object:
     try:
         return tomllib.loads(value)
     except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise ValueError(f"the stage is no TOML: {error}") from None
+        raise ValueError(f"the stage is no TOML: {toml_complaint(value, error)}") from None
 
 
 class RenderOptions(PictureOptions):

@@ -46,7 +46,7 @@ def refusals_from(error: ValidationError, model: type[BaseModel]) -> list[Refusa
         if fault["type"] == "extra_forbidden":
             refusal = _unknown_field_refusal(model, fault["loc"])
         else:
-            path, _, _ = _path_in(model, fault["loc"])
+            path, _, _ = path_in_model(model, fault["loc"])
             refusal = Refusal(path, fault["type"], _fault_sentence(path, fault))
         found.setdefault(refusal.path, refusal)
     return list(found.values())
@@ -105,7 +105,7 @@ def _fault_sentence(path: Sequence[str | int], fault: Mapping[str, Any]) -> str:
 
 def _unknown_field_refusal(model: type[BaseModel], place: Sequence[str | int]) -> Refusal:
     """Return the refusal of a field that a model does not have."""
-    path, models, kind = _path_in(model, place[:-1])
+    path, models, kind = path_in_model(model, place[:-1])
     if kind:
         models = tuple(inner for inner in models if inner.model_fields["kind"].default == kind)
     prefix = f"{setting_name(path)}." if path else ""
@@ -113,7 +113,11 @@ def _unknown_field_refusal(model: type[BaseModel], place: Sequence[str | int]) -
     return refuse_unknown_setting((*path, place[-1]), known, kind)
 
 
-def _path_in(
+def _kind_of(model: type[BaseModel]) -> object:
+    return model.model_fields["kind"].default if "kind" in model.model_fields else None
+
+
+def path_in_model(
     model: type[BaseModel], place: Sequence[str | int]
 ) -> tuple[tuple[str | int, ...], tuple[type[BaseModel], ...], str]:
     """Return the path of a setting without the parts that pydantic adds for union types.
@@ -125,6 +129,10 @@ def _path_in(
     models: tuple[type[BaseModel], ...] = (model,)
     kind = ""
     for part in place:
+        tagged = [] if kind or len(models) < 2 else [inner for inner in models if _kind_of(inner) == part]
+        if tagged:  # pydantic names the kind first, which may also be the name of a field
+            models, kind = tuple(tagged), str(part)
+            continue
         infos = [inner.model_fields[part] for inner in models if part in inner.model_fields]
         if infos:
             models, kind = submodels(infos[0].annotation), ""

@@ -9,7 +9,7 @@ import pytest
 
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.files import read_mesh
-from octasplat.engine.pathtracing.stage.materials import Glass, MetallicRoughness
+from octasplat.engine.pathtracing.stage.materials import Diffuse, Glass, MetallicRoughness
 from octasplat.engine.pathtracing.stage.model import PointLight, RectangleLight, Stage
 from octasplat.engine.pathtracing.stage.stage_file import (
     StageLayout,
@@ -84,12 +84,26 @@ def test_stage_file_with_all_keys_is_read(tmp_path: Path) -> None:
         ("[integrator]\naperture = 0.1", "needs a focus_distance"),
         ("[integrator]\nsamples = 0", r"integrator\.samples"),
         ("[[gaussians]]\nscale = [1, 2, 3]", "one scale"),
+        ("[[lights]]\nposition = [0, 0, 0]", r"lights\[0\]: has no `kind`"),
+        ('[[lights]]\nkind = "lamp"', "no kind 'lamp'; choose one of 'point', 'spot'"),
+        ('[meshes]\nshape = "cube"', r"write \[\[meshes\]\] with two brackets"),
+        (BALL + "scale = [1, 2]", r"meshes\[0\]\.scale: is one positive number, or three"),
+        ("up = [0, 1]", r"up: is three numbers, such as \[0, 0, 1\] \(it is \[0, 1\]\)"),
+        (BALL + 'material = { kind = "diffuse", color_srgb = "#ff00" }', r"material\.color_srgb: .*#cc8033"),
+        (BALL + 'material = { kind = "diffuse", color = 1 }', r"material\.color; the nearest is color_srgb"),
+        (BALL + "positon = [0, 0, 0]", "the nearest is position"),
+        (BALL + "scale = .2", r"write 0\.2 for \.2"),
     ],
 )
 def test_stage_file_error_names_key(text: str, words: str) -> None:
     with pytest.raises(ConfigError, match=words) as caught:
         parse_stage(text, "my.toml")
     assert str(caught.value).startswith("my.toml: ") and "\n" not in str(caught.value)
+
+
+def test_stage_color_may_be_hexadecimal() -> None:
+    stage = parse_stage(BALL + 'material = { kind = "diffuse", color_srgb = "#ff8000" }', "my.toml")
+    assert stage.meshes[0].material == Diffuse(color_srgb=(1.0, 128 / 255, 0.0))
 
 
 def test_stage_file_too_many_lights_is_refused() -> None:

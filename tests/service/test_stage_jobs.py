@@ -93,6 +93,10 @@ BAD = [
         "[[meshes]]\nfile = 'thing.obj'\nmaterial = { kind = 'diffuse', texture = 'wood.png' }",
         "file-missing", "#/options/stage/meshes/0/material/texture", "'wood.png'",
     ),
+    (
+        "[[meshes]]\nshape = 'cube'\nscale = [1, 2]",
+        "options", "#/options/stage/meshes/0/scale", "one positive number, or three",
+    ),
     ("[integrator]\nlayers = true", "options", "#/options/", "choose the format exr"),
     ("[integrator]\nsamples = 65536", "ceiling", "#/options/stage/integrator/samples", "paths of light"),
     (

@@ -1,15 +1,27 @@
 """Types of values in a stage, and the base of its models. Imports neither torch nor numba."""
 
+import re
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 UnitInterval = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 Vector = tuple[Finite, Finite, Finite]
-Color = tuple[UnitInterval, UnitInterval, UnitInterval]
+Rgb = tuple[UnitInterval, UnitInterval, UnitInterval]
+
+
+def _read_hexadecimal(value: object) -> object:
+    """Return the display values of a text such as ``#cc8033``; any other value as it is."""
+    if isinstance(value, str) and re.fullmatch(r"#[0-9a-fA-F]{6}", value):
+        return tuple(int(value[k : k + 2], 16) / 255 for k in (1, 3, 5))
+    return value
+
+
+Color = Annotated[Rgb, BeforeValidator(_read_hexadecimal, json_schema_input_type=Rgb | str)]
+"""Display values, or a text such as ``#cc8033``."""
 WHITE = (1.0, 1.0, 1.0)
 
 

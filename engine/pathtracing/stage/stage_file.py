@@ -1,7 +1,8 @@
 """Stage files: TOML read and validated, and a commented template written. Imports neither torch nor numba."""
 
+import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.writing import write_text
 from octasplat.engine.pathtracing.stage.model import Stage
 from octasplat.engine.pathtracing.stage.sidecar_files import sidecar_files
+from octasplat.engine.pathtracing.stage.stage_errors import stage_error
 
 MAX_STAGE_BYTES = 16 << 20
 TEXTURE_KEYS = ("texture", "metallic_roughness_texture", "normal_texture", "emission_texture")
@@ -47,9 +49,18 @@ def parse_stage(text: str, name: str) -> Stage:
     try:
         return Stage.model_validate(tomllib.loads(text))
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{name}: is no TOML: {error}.") from None
+        raise ConfigError(f"{name}: is no TOML: {toml_complaint(text, error)}.") from None
     except ValidationError as error:
-        raise ConfigError(f"{name}: {_error_message(error)}") from None
+        raise ConfigError(f"{name}: {stage_error(error.errors()[0])[1]}") from None
+
+
+def toml_complaint(text: str, error: Exception) -> str:
+    """Return what is wrong with a TOML text, with the rule that numbers begin with a digit where it helps."""
+    lines, place = text.splitlines(), re.search(r"line (\d+)", str(error))
+    line = lines[int(place[1]) - 1] if place is not None and int(place[1]) <= len(lines) else ""
+    if number := re.search(r"(?<![\w.])[-+]?\.\d+", line):
+        return f"{error}; write {number[0].replace('.', '0.')} for {number[0]}"
+    return str(error)
 
 
 def referenced_files(stage: Stage) -> Iterator[tuple[str, str]]:
@@ -149,43 +160,6 @@ BALL_HANGING = "No floor is to be seen: a ball that hangs before what the camera
 def _format_vector(values: tuple[float, ...]) -> str:
     return "[" + ", ".join(f"{value:.4g}" for value in values) + "]"
 
-
-def _error_message(error: ValidationError) -> str:
-    """Return the first error, with its key as written in the file."""
-    first = error.errors()[0]
-    return stage_error_message(first["type"], stage_key_path(first["loc"]), first["msg"], first.get("input"))
-
-
-def stage_key_path(location: Sequence[int | str]) -> tuple[int | str, ...]:
-    """Return the keys of a stage file at which pydantic found an error.
-
-    The kinds of a union stand in the location too, but are no keys.
-    """
-    return tuple(part for number, part in enumerate(location) if number == 0 or part not in _UNION_TAGS)
-
-
-def stage_error_message(kind: str, keys: Sequence[int | str], message: str, value: object) -> str:
-    """Return one of pydantic's errors as a sentence.
-
-    Args:
-        kind: of the fault, as pydantic calls it.
-        keys: where it is.
-        message: pydantic's own.
-        value: what is there.
-    """
-    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in keys).removeprefix(".")
-    if kind == "extra_forbidden":
-        return f"there is no key {key}; see docs/light.md for those that there are."
-    message = message.removeprefix("Value error, ")
-    if kind in ("too_long", "missing", "value_error"):
-        return f"{key or 'the stage'}: {message}."
-    return f"{key}: {message} (it is {str(value)[:60]})."
-
-
-_UNION_TAGS = (
-    "diffuse", "mirror", "glass", "metal", "dielectric", "metallic-roughness", "point", "spot",
-    "directional", "rectangle", "float", "constrained-float",
-)  # fmt: skip
 
 _TEMPLATE = """\
 # A stage: things, lights and how the scene takes part. Lengths are in the scene's units, colors are
