@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Bool, Float32, Float64
 from scipy.spatial import cKDTree
 
 from octasplat.engine.core.errors import ConfigError
@@ -27,6 +27,11 @@ MIN_OPACITY = 0.3
 MIN_LEVEL_FRACTION = 0.08
 """Share of the surface at the floor's height that looks up; of a scene without a floor it is some 0.05, as if
 surfaces looked anywhere, of a crumpled blanket 0.11, of a table with things on it one half."""
+ALONE_FRACTION = 0.9
+"""Share of the surface about what the cameras look at, in a scene of a thing that stands alone."""
+LOWEST_QUANTILE = 0.005
+"""Share of the surface of a thing that may lie below its foot, as stray Gaussians do."""
+BESIDE_SPOTS = 32
 HANGING_FRACTIONS = (0.2, 0.3, 0.4, 0.5, 0.6)
 """Where a ball hangs free, on the way from what the cameras look at to the middle of them."""
 
@@ -118,11 +123,17 @@ def estimate_stage_layout(
     away = np.linalg.norm(spots - centre_world, axis=1)
     floor = spots[np.argmax(size * transmittance + free - 0.7 * away)]
     light = -_estimate_light_direction(some.base_rgb_srgb, normals, area, up)
-    if (
-        level_fraction(some.means_world @ up, normals @ up, area, float(spots[0] @ up), size)
-        >= MIN_LEVEL_FRACTION
-    ):
-        return _stage_layout(up, floor, size, light)
+    heights, cosines = some.means_world.astype(np.float64) @ up, normals @ up
+    height = float(spots[0] @ up)
+    if level_fraction(heights, cosines, area, height, size) >= MIN_LEVEL_FRACTION:
+        if not (_stands_alone(gaussians, near) and _is_within(heights, cosines, area, height, size)):
+            return _stage_layout(up, floor, size, light)
+        spots = _spots_beside(some.means_world.astype(np.float64), area, up, size)
+        ways = [RayBatch.between(camera[None], spots + 0.05 * size * up) for camera in cameras_world]
+        transmittance = np.mean([tracer.transmittance(way) for way in ways], axis=0)
+        nearness = (spots - centre_world) @ (cameras_world.mean(axis=0) - centre_world)
+        best = np.lexsort((nearness, np.round(transmittance, 2)))[-1]
+        return replace(_stage_layout(up, spots[best], size, light), is_beside=True)
     places = centre_world + np.array(HANGING_FRACTIONS)[:, None] * (cameras_world.mean(axis=0) - centre_world)
     transmittance = np.mean(
         [tracer.transmittance(RayBatch.between(c[None], places)) for c in cameras_world], axis=0
@@ -131,6 +142,45 @@ def estimate_stage_layout(
     return replace(
         _stage_layout(up, hanging - BALL_RADIUS_FRACTION * size * up, size, light), has_floor=False
     )
+
+
+def _stands_alone(gaussians: FlatGaussians, near: Bool[np.ndarray, " n"]) -> bool:
+    """Return whether next to nothing of the scene lies elsewhere than what the cameras look at."""
+    area = gaussians.opacities * np.exp(gaussians.log_scales.sum(axis=1))
+    return bool(area[near].sum() > ALONE_FRACTION * area.sum())
+
+
+def _is_within(
+    heights: Float64[np.ndarray, " n"],
+    cosines: Float64[np.ndarray, " n"],
+    area: Float64[np.ndarray, " n"],
+    height: float,
+    size: float,
+) -> bool:
+    """Return whether more of the surface lies below a height than is level there."""
+    level = (np.abs(heights - height) < 0.05 * size) & (cosines > LEVEL_COSINE)
+    return bool(area[heights < height - 0.06 * size].sum() > area[level].sum())
+
+
+def _spots_beside(
+    points: Float64[np.ndarray, "n 3"],
+    area: Float64[np.ndarray, " n"],
+    up: Float64[np.ndarray, "3"],
+    size: float,
+) -> Float64[np.ndarray, "s 3"]:
+    """Return places around a thing, on a level with its lowest point."""
+    heights = points @ up
+    order = np.argsort(heights)
+    shares = np.cumsum(area[order]) / area.sum()
+    foot = heights[order[np.searchsorted(shares, LOWEST_QUANTILE)]]
+    level = points - heights[:, None] * up
+    middle = (level * area[:, None]).sum(axis=0) / area.sum()
+    across = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    across /= np.linalg.norm(across)
+    angles = 2 * np.pi * np.arange(BESIDE_SPOTS) / BESIDE_SPOTS
+    ways = np.cos(angles)[:, None] * across + np.sin(angles)[:, None] * np.cross(up, across)
+    reach = np.quantile((level - middle) @ ways.T, 0.99, axis=0) + 1.5 * BALL_RADIUS_FRACTION * size
+    return np.asarray(middle + reach[:, None] * ways + foot * up)
 
 
 def level_fraction(

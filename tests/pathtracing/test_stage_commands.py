@@ -115,3 +115,36 @@ def test_invalid_stage_is_refused_before_rendering(
 
 def test_preview_wants_a_stage_and_one_file(scene: Path, tmp_path: Path) -> None:
     assert octasplat("render", scene, "-o", tmp_path / "a.png", "--preview").exit_code == 2
+
+
+def test_stage_init_thing_that_stands_alone_has_its_floor_at_its_foot(tmp_path: Path) -> None:
+    # A pillar of radius 0.2 from y = 0 up to y = -2 with a shelf at half height: up is -y.
+    angle, height = (part.ravel() for part in np.meshgrid(np.linspace(0, 6.2, 40), np.linspace(0, -2, 40)))
+    shelf_x, shelf_z = (part.ravel() for part in np.meshgrid(*[np.linspace(-0.35, 0.35, 20)] * 2))
+    means = np.concatenate(
+        [
+            np.stack([0.2 * np.cos(angle), height, 0.2 * np.sin(angle)], axis=1),
+            np.stack([shelf_x, np.full(shelf_x.size, -1.0), shelf_z], axis=1),
+        ]
+    ).astype(np.float32)
+    half = np.sqrt(0.5)
+    around = np.stack(
+        [np.cos(angle / 2), 0 * angle, -np.sin(angle / 2), 0 * angle], axis=1
+    )  # x to the normal
+    flat = np.tile([half, 0, 0, -half], (shelf_x.size, 1))  # the normal along -y
+    count = len(means)
+    pillar = FlatGaussians(
+        means,
+        np.concatenate([around, flat]).astype(np.float32),
+        np.full((count, 2), -3.5, np.float32),
+        np.full(count, 4.0, np.float32),
+        np.zeros((count, 1, 3), np.float32),
+    )
+    write_gaussian_ply(pillar, tmp_path / "pillar.ply")
+    done = octasplat("stage", "init", tmp_path / "pillar.ply", "-o", tmp_path / "stage.toml")
+    assert done.exit_code == 0, done.output
+    assert "a thing that stands alone" in (tmp_path / "stage.toml").read_text()
+    ball = read_stage(tmp_path / "stage.toml").meshes[0]
+    assert isinstance(ball.scale, float)
+    assert ball.position[1] + ball.scale == pytest.approx(0.0, abs=0.05)
+    assert np.hypot(ball.position[0], ball.position[2]) > 0.2 + ball.scale

@@ -116,6 +116,7 @@ class StageLayout:
         size: about as large as what the cameras look at, world units.
         light_direction: the way that the scene's light seems to go.
         has_floor: whether the scene shows anything level to stand on.
+        is_beside: whether the scene is a thing that stands alone, beside whose foot the floor is.
         note: a sentence about the positions, for the head of the file.
     """
 
@@ -124,6 +125,7 @@ class StageLayout:
     size: float
     light_direction: tuple[float, float, float]
     has_floor: bool = True
+    is_beside: bool = False
     note: str = ""
 
 
@@ -143,7 +145,10 @@ def write_stage_template(path: Path, layout: StageLayout) -> None:
             up=_format_vector(layout.up),
             centre=_format_vector(centre),
             floor=_format_vector(layout.floor),
-            where=BALL_ON_FLOOR if layout.has_floor else BALL_HANGING,
+            where=BALL_BESIDE if layout.is_beside else BALL_ON_FLOOR if layout.has_floor else BALL_HANGING,
+            # Around a thing that stands alone there is nothing for glass to show.
+            material=_LACQUER if layout.is_beside else _GLASS,
+            other_material=_GLASS if layout.is_beside else _LACQUER,
             light=_format_vector(layout.light_direction),
             lamp=_format_vector(lamp),
             radius=f"{radius:.4g}",
@@ -153,7 +158,10 @@ def write_stage_template(path: Path, layout: StageLayout) -> None:
     )
 
 
+_GLASS = '{ kind = "glass", ior = 1.5 }'
+_LACQUER = '{ kind = "dielectric", color_srgb = [0.7, 0.1, 0.1], roughness = 0.2 }'
 BALL_ON_FLOOR = "A ball on what seems to be the floor, at"
+BALL_BESIDE = "The scene is a thing that stands alone: a ball beside it, on a level with its foot, at"
 BALL_HANGING = "No floor is to be seen: a ball that hangs before what the cameras look at, above"
 
 
@@ -180,10 +188,10 @@ shape = "sphere"                 # or: file = "thing.obj"
 position = {centre}
 scale = {radius}
 smooth_degrees = 180
-material = {{ kind = "glass", ior = 1.5 }}
+material = {material}
+# material = {other_material}
 # material = {{ kind = "mirror" }}
 # material = {{ kind = "metal", color_srgb = [0.95, 0.8, 0.5], roughness = 0.25 }}
-# material = {{ kind = "dielectric", color_srgb = [0.7, 0.1, 0.1], roughness = 0.2 }}
 # To stand on what a pixel of a photograph shows (its position then counts from there):
 # on = {{ view = "0001.jpg", pixel = [200, 300] }}
 
