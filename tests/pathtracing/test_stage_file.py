@@ -91,7 +91,7 @@ def test_stage_file_with_all_keys_is_read(tmp_path: Path) -> None:
         ("up = [0, 1]", r"up: is three numbers, such as \[0, 0, 1\] \(it is \[0, 1\]\)"),
         (BALL + 'material = { kind = "diffuse", color_srgb = "#ff00" }', r"material\.color_srgb: .*#cc8033"),
         (BALL + 'material = { kind = "diffuse", color = 1 }', r"material\.color; the nearest is color_srgb"),
-        (BALL + "positon = [0, 0, 0]", "the nearest is position"),
+        (BALL + "positions = [0, 0, 0]", "the nearest is position"),
         (BALL + "scale = .2", r"write 0\.2 for \.2"),
     ],
 )
