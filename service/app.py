@@ -37,6 +37,7 @@ from octasplat.service.routes import (
     events_and_logs,
     jobs,
     metrics,
+    resumable_uploads,
     scene_previews,
     system,
     tokens,
@@ -108,7 +109,8 @@ def create_app(settings: ServiceSettings | None = None) -> FastAPI:
         license_info={"name": "Apache-2.0", "identifier": "Apache-2.0"},
     )
     for module_router in (
-        datasets.router, dataset_tasks.router, scene_previews.router, jobs.router, estimates.router,
+        datasets.router, dataset_tasks.router, resumable_uploads.router, scene_previews.router,
+        jobs.router, estimates.router,
         events_and_logs.router, artifacts.router, webhooks.router, tokens.router, system.router,
         system.health_router, metrics.router, audit.router,
     ):  # fmt: skip

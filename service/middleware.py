@@ -84,7 +84,7 @@ class BodyLimitMiddleware:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on with its limit."""
-        if scope["type"] != "http" or scope["method"] == "PUT":
+        if scope["type"] != "http" or scope["method"] == "PUT" or _is_part_of_upload(scope):
             await self._app(scope, receive, send)
             return
         replaced = False
@@ -102,6 +102,11 @@ class BodyLimitMiddleware:
 
         limited = (app for prefix, app in self._longer.items() if scope["path"].startswith(prefix))
         await next(limited, self._limited)(scope, receive, send_as_problem)
+
+
+def _is_part_of_upload(scope: Scope) -> bool:
+    """Return whether a request sends a part of a file that is uploaded in parts."""
+    return bool(scope["method"] == "PATCH" and _UPLOAD_PATH.fullmatch(scope["path"]))
 
 
 class CompressionMiddleware:
@@ -144,6 +149,7 @@ class SecurityHeadersMiddleware(HttpMiddleware):
 _STORED_CONTENT = re.compile(
     r"/v1/(jobs|datasets)/[^/]+/((artifacts|files)/.+|preview|archive|events)", re.DOTALL
 )
+_UPLOAD_PATH = re.compile(r"/v1/datasets/[^/]+/uploads/[^/]+")
 _PLAIN_TEXT_HEADER = (b"content-type", b"text/plain; charset=utf-8")
 _SECURITY_HEADERS = (
     (b"x-content-type-options", b"nosniff"),

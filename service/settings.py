@@ -21,6 +21,8 @@ from octasplat.workers.worker.job_kinds.resource_limits import LIMIT_UNITS
 
 DEFAULT_PORT = 8642
 MIN_TOKEN_BITS = 128
+MAX_UPLOADS = 50
+"""Uploads of an owner that may be under way in parts."""
 MAX_WAIT_SECONDS = 50
 """An answer waits no longer for a task, as usual proxies give up after 60 s."""
 _BODY_SECONDS = 90.0
@@ -166,6 +168,12 @@ class ServiceSettings(WorkerSettings):
         """Return how many imports there may be: connections, not work."""
         return TaskShares(
             max_running=8, max_running_per_owner=4, max_unfinished=64, max_unfinished_per_owner=16
+        )
+
+    def upload_shares(self) -> TaskShares:
+        """Return how many uploads that came in parts are stored at once: copies within the store."""
+        return TaskShares(
+            max_running=3, max_running_per_owner=2, max_unfinished=1000, max_unfinished_per_owner=MAX_UPLOADS
         )
 
     def connection_limits(self, open_files: int) -> ConnectionLimits:

@@ -50,7 +50,8 @@ async def request_commit(service: Service, principal: Principal, dataset_id: uui
                 return task
         if unfinished:
             raise ConflictError(
-                f"{len(unfinished)} imports into the dataset are under way; commit it when they are over."
+                f"{len(unfinished)} imports or uploads into the dataset are under way; commit it when they "
+                "are over."
             )
         await check_share(connection, service.settings.check_shares(), owner, "commit")
         await rows.announce_check(connection, dataset)

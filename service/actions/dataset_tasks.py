@@ -19,7 +19,11 @@ from octasplat.workers.db.rows import Dataset
 
 _FIRST_LOOK_SECONDS, _LAST_LOOK_SECONDS = 0.02, 0.5
 _RETRY_SECONDS = 10
-_NOUNS: Mapping[TaskKind, str] = {"commit": "commits of datasets", "import": "imports"}
+_NOUNS: Mapping[TaskKind, str] = {
+    "commit": "commits of datasets",
+    "import": "imports",
+    "upload": "uploads",
+}
 
 
 async def _nothing(_connection: Connection) -> None:

@@ -27,8 +27,6 @@ from octasplat.workers.maintenance.webhooks.sender import guarded_client
 MAX_REDIRECTS = 5
 HEADER_SECONDS = 30.0
 """For an address to begin its answer."""
-MAX_LEFT_OUT = 1000
-"""Names of files left out that the result of an import lists at most."""
 
 
 @retry_on_deadlock
@@ -54,7 +52,9 @@ async def request_import(
         raise _import_error(str(error), "import-address") from None
     async with service.pool.connection() as connection, connection.transaction():
         dataset = await open_dataset(connection, principal, dataset_id)
-        if new.path is not None:
+        if new.path is None:
+            uploads.check_takes_archives(dataset)
+        else:
             uploads.check_file_name_of(dataset, new.path)
 
         async def make() -> uuid.UUID:
@@ -85,12 +85,7 @@ async def run_import(service: Service, task: DatasetTask) -> TaskOutcome:
         text = answer.headers.get("content-length", "")
         length = int(text) if text.isdigit() and "content-encoding" not in answer.headers else None
         upload = Upload(_body(answer), sha256=new.sha256, size_bytes=length)
-        if new.path is not None:
-            await uploads.put_file(service, owner, task.dataset_id, new.path, upload)
-            return TaskOutcome({"files": 1, "left_out": [], "notes": []})
-        stored = await uploads.put_archive(service, owner, task.dataset_id, upload)
-    left_out = list(stored.left_out[:MAX_LEFT_OUT])
-    return TaskOutcome({"files": len(stored.files), "left_out": left_out, "notes": list(stored.notes)})
+        return TaskOutcome(await uploads.store_named(service, owner, task.dataset_id, new.path, upload))
 
 
 @asynccontextmanager

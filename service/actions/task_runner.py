@@ -13,6 +13,7 @@ from octasplat.engine.core.errors import OctasplatError
 from octasplat.service.actions.commits import run_commit
 from octasplat.service.actions.dataset_tasks import TaskOutcome
 from octasplat.service.actions.imports import run_import
+from octasplat.service.actions.resumable_uploads import run_upload
 from octasplat.service.problems import ProblemError, problem_from_error, unexpected_problem
 from octasplat.service.settings import TaskShares
 from octasplat.service.state import Service
@@ -48,6 +49,7 @@ class TaskRunner:
         self._kinds: Mapping[TaskKind, tuple[Work, TaskShares]] = {
             "commit": (run_commit, settings.check_shares()),
             "import": (run_import, settings.import_shares()),
+            "upload": (run_upload, settings.upload_shares()),
         }
         self._running: dict[asyncio.Task[None], DatasetTask] = {}
         self._renewed_at = self._announced_at = 0.0

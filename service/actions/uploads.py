@@ -4,7 +4,7 @@ import logging
 import uuid
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from octasplat.service.actions.access import (
     check_not_draining,
@@ -31,12 +31,15 @@ from octasplat.workers.db import datasets as rows
 from octasplat.workers.db.connections import retry_on_deadlock
 from octasplat.workers.db.quotas import QuotaExceededError, bytes_left, check_bytes, owned_bytes
 from octasplat.workers.db.rows import Dataset, DatasetFile
+from octasplat.workers.db.uploads import FileUpload, delete_upload
 from octasplat.workers.queue.storage_leases import StorageLease
 from octasplat.workers.storage.errors import BlobNotFoundError, ContentTooLargeError
 from octasplat.workers.storage.protocol import Storage
 
 logger = logging.getLogger(__name__)
 ReceivedT = TypeVar("ReceivedT")
+MAX_LEFT_OUT = 1000
+"""Names of files left out that a task lists at most."""
 
 
 @dataclass(frozen=True)
@@ -47,11 +50,18 @@ class Upload:
         body: its bytes, as they come.
         sha256: the digest that was announced.
         size_bytes: the length that was announced.
+        parts: the upload whose parts are this body, and go when it is stored.
     """
 
     body: AsyncIterator[bytes]
     sha256: str | None = None
     size_bytes: int | None = None
+    parts: FileUpload | None = None
+
+    @property
+    def part_bytes(self) -> int:
+        """Return how much of what is stored goes with the parts."""
+        return 0 if self.parts is None else self.parts.size_bytes
 
 
 @dataclass(frozen=True)
@@ -139,7 +149,7 @@ async def put_file(
         logger.warning("the store lost %s of dataset %s, which is sent again", path, dataset_id)
     if left is not None:
         # What it replaces goes, and content that its owner has already counts once.
-        left += had + (known.size_bytes if known is not None else 0)
+        left += had + (known.size_bytes if known is not None else 0) + upload.part_bytes
 
     def receive() -> Awaitable[ReceivedFile]:
         return receive_file(
@@ -155,7 +165,7 @@ async def put_file(
 
     async with service.evictor.upload_lease(upload.size_bytes) as note:
         received = await _limited_by_quota(receive, left)
-        [row] = await _record_files(service, dataset, note, [received])
+        [row] = await _record_files(service, dataset, note, [received], upload.parts)
     return StoredFile(row, is_unchanged=False)
 
 
@@ -176,13 +186,10 @@ async def put_archive(
         dataset = await open_dataset(connection, principal, dataset_id)
         left = await bytes_left(connection, dataset.owner, service.settings.quota)
         known = await rows.files_of(connection, dataset_id)
-    if dataset.holds == "files":
-        raise ProblemError(
-            409, "holds-files", "Files that options name are sent one by one, not as an archive."
-        )
+    check_takes_archives(dataset)
     if left is not None:
         # What it replaces goes, all of it where the archive is sent again; the exact count comes at the end.
-        left += sum(file.size_bytes for file in known)
+        left += sum(file.size_bytes for file in known) + upload.part_bytes
 
     def receive() -> Awaitable[ReceivedArchive]:
         return receive_archive(
@@ -198,7 +205,7 @@ async def put_archive(
 
     async with service.evictor.upload_lease(upload.size_bytes) as note:
         received = await _limited_by_quota(receive, left)
-        files = await _record_files(service, dataset, note, received.files)
+        files = await _record_files(service, dataset, note, received.files, upload.parts)
     return StoredArchive(files, received.left_out, received.notes)
 
 
@@ -208,6 +215,34 @@ def _is_stored(storage: Storage, file: DatasetFile) -> bool:
         return storage.stat(file.sha256).size_bytes == file.size_bytes
     except BlobNotFoundError:
         return False
+
+
+async def store_named(
+    service: Service, principal: Principal, dataset_id: uuid.UUID, path: str | None, upload: Upload
+) -> dict[str, Any]:
+    """Store a file, or a ZIP file's if ``path`` is None; returns what a task tells of it.
+
+    Raises:
+        Exception: as by :func:`put_file` and :func:`put_archive`.
+    """
+    if path is not None:
+        await put_file(service, principal, dataset_id, path, upload)
+        return {"files": 1, "left_out": [], "notes": []}
+    stored = await put_archive(service, principal, dataset_id, upload)
+    left_out = list(stored.left_out[:MAX_LEFT_OUT])
+    return {"files": len(stored.files), "left_out": left_out, "notes": list(stored.notes)}
+
+
+def check_takes_archives(dataset: Dataset) -> None:
+    """Refuse an archive for a dataset that takes single files.
+
+    Raises:
+        ProblemError: 409.
+    """
+    if dataset.holds == "files":
+        raise ProblemError(
+            409, "holds-files", "Files that options name are sent one by one, not as an archive."
+        )
 
 
 def check_file_name_of(dataset: Dataset, path: str) -> ContentCheck:
@@ -237,11 +272,17 @@ async def _limited_by_quota(receive: Callable[[], Awaitable[ReceivedT]], bytes_l
 
 @retry_on_deadlock
 async def _record_files(
-    service: Service, dataset: Dataset, lease: StorageLease, received: Sequence[ReceivedFile]
+    service: Service,
+    dataset: Dataset,
+    lease: StorageLease,
+    received: Sequence[ReceivedFile],
+    parts: FileUpload | None,
 ) -> list[DatasetFile]:
-    """Record stored files in the dataset, all or none."""
+    """Record stored files in the dataset, all or none, in the place of the parts that they came in."""
     new = [rows.NewFile(f.path, f.blob.sha256, f.blob.size_bytes, f.facts) for f in received]
     async with lease.reference({file.sha256 for file in new}) as connection:
+        if parts is not None:
+            await delete_upload(connection, parts)
         files = await rows.put_files(connection, dataset.id, new)
         await check_bytes(connection, dataset.owner, service.settings.quota)
     service.metrics.upload_bytes.inc(sum(file.blob.size_bytes for file in received))

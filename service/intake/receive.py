@@ -6,7 +6,7 @@ import binascii
 import re
 import tempfile
 import time
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping
 from dataclasses import dataclass, field
 from typing import BinaryIO
 
@@ -22,11 +22,14 @@ from octasplat.service.intake.faults import IntakeError, IntakeFault
 from octasplat.service.intake.images import ImageHeader, ImageLimits
 from octasplat.service.intake.spool import SpoolSpace
 from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
+from octasplat.workers.storage.errors import ContentTooLargeError
 from octasplat.workers.storage.os_errors import translate_os_errors
 from octasplat.workers.storage.protocol import Blob, BlobWriter, Storage
 from octasplat.workers.storage.verifying_writer import VerifyingWriter
 
 PIECE_BYTES = 1 << 20
+PART_BYTES = 16 << 20
+"""Parts of an upload that can be continued; what has come of the last one is lost with the process."""
 _SHA256 = re.compile(r"(?:^|,)\s*sha-256\s*=\s*:([A-Za-z0-9+/=]*):\s*(?:;[^,]*)?(?=,|$)")
 
 
@@ -141,6 +144,54 @@ async def receive_body(stream: AsyncIterator[bytes], writer: BlobWriter, limits:
     except BaseException:
         await asyncio.shield(run_in_pool(ThreadPurpose.UPLOADS, writer.abort))
         raise
+
+
+async def receive_parts(
+    storage: Storage, stream: AsyncIterator[bytes], *, max_bytes: int, limits: UploadLimits = DEFAULT_LIMITS
+) -> AsyncGenerator[Blob, None]:
+    """Store a body in parts and yield each; what has come of one that breaks off is stored before the error.
+
+    Args:
+        storage: where to.
+        stream: the body, in pieces of any length.
+        max_bytes: length at which it is refused.
+        limits: how slow it may be.
+
+    Raises:
+        IntakeError: ``upload-stalled`` or ``upload-too-slow``.
+        StorageError: it is too long, or there is no room.
+    """
+    pieces = _limited_in_time(stream, limits)
+    writer: BlobWriter | None = None
+    pending, stored_bytes, ended = bytearray(), 0, False
+    failure: Exception | None = None
+    try:
+        while not ended:
+            try:
+                piece = await anext(pieces)
+                max_bytes -= len(piece)
+                pending += piece if max_bytes >= 0 else b""
+                if max_bytes < 0:
+                    raise ContentTooLargeError("More came than the upload has left; ask for its offset.")
+            except StopAsyncIteration:
+                ended = True
+            except Exception as error:  # noqa: BLE001 - raised below, once what has come is stored
+                failure, ended = error, True
+            if len(pending) >= PIECE_BYTES or (ended and pending):
+                if writer is None:
+                    writer = await run_in_pool(ThreadPurpose.UPLOADS, storage.open_writer)
+                await run_in_pool(ThreadPurpose.UPLOADS, writer.write, bytes(pending))
+                stored_bytes += len(pending)
+                pending.clear()
+            if writer is not None and (ended or stored_bytes >= PART_BYTES):
+                blob = await run_in_pool(ThreadPurpose.UPLOADS, writer.commit)
+                writer, stored_bytes = None, 0
+                yield blob
+    finally:
+        if writer is not None:
+            await asyncio.shield(run_in_pool(ThreadPurpose.UPLOADS, writer.abort))
+    if failure is not None:
+        raise failure
 
 
 async def _limited_in_time(stream: AsyncIterator[bytes], limits: UploadLimits) -> AsyncIterator[bytes]:

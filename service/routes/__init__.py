@@ -13,7 +13,8 @@ def problem_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
         400: "Malformed", 401: "No valid token", 403: "The token's scope does not suffice",
         404: "There is no such thing, or it is not yours", 408: "The upload stalled",
         409: "Its state does not allow that", 410: "The content is gone", 412: "It has changed",
-        413: "Too long", 416: "No such range", 421: "A foreign host name", 422: "Refused; see errors",
+        413: "Too long", 415: "Another media type is needed",
+        416: "No such range", 421: "A foreign host name", 422: "Refused; see errors",
         429: "Too many requests, or wrong tokens", 503: "Try again later", 507: "No room",
     }  # fmt: skip
     headers = {

@@ -206,10 +206,10 @@ def _dataset_etag(dataset: Dataset) -> str:
 def _upload_of_request(request: Request, digest: str | None) -> uploads.Upload:
     text = request.headers.get("content-length")
     length = int(text) if text is not None and text.isdigit() else None
-    return uploads.Upload(_request_body(request), sha256=parse_digest(digest), size_bytes=length)
+    return uploads.Upload(request_body(request), sha256=parse_digest(digest), size_bytes=length)
 
 
-async def _request_body(request: Request) -> AsyncIterator[bytes]:
+async def request_body(request: Request) -> AsyncIterator[bytes]:
     """Yield the body of a request; one that breaks off leaves nothing."""
     try:
         async for piece in request.stream():

@@ -6,23 +6,24 @@ from typing import Any
 Header = Mapping[str, Any]
 
 
-def _header(name: str, description: str, kind: str = "string") -> Header:
+def header(name: str, description: str, kind: str = "string") -> Header:
+    """Return the OpenAPI description of a header."""
     return {name: {"description": description, "schema": {"type": kind}}}
 
 
-LOCATION = _header("Location", "Address of what was made.")
-RETRY_AFTER = _header("Retry-After", "Seconds after which another look, or try, is worth while.", "integer")
-ETAG = _header("ETag", "Changes with the content; for `If-None-Match` and `If-Match`.")
+LOCATION = header("Location", "Address of what was made.")
+RETRY_AFTER = header("Retry-After", "Seconds after which another look, or try, is worth while.", "integer")
+ETAG = header("ETag", "Changes with the content; for `If-None-Match` and `If-Match`.")
 RATE_LIMIT = (
-    _header("RateLimit-Policy", 'Your quota, such as `"jobs";q=20`; absent without one.'),
-    _header("RateLimit", 'What is left of your quota, such as `"jobs";r=3`; absent without one.'),
+    header("RateLimit-Policy", 'Your quota, such as `"jobs";q=20`; absent without one.'),
+    header("RateLimit", 'What is left of your quota, such as `"jobs";r=3`; absent without one.'),
 )
-LINK = _header("Link", 'The next part of the list, as `<address>; rel="next"` (RFC 8288); absent at the end.')
-CONTENT_RANGE = _header("Content-Range", "Which bytes of how many.")
-WWW_AUTHENTICATE = _header("WWW-Authenticate", "How to show a token.")
-DIGEST = _header("Repr-Digest", "SHA-256 of the whole content (RFC 9530).")
-DISPOSITION = _header("Content-Disposition", "File name for whoever saves it.")
-CONTENT = (ETAG, DIGEST, DISPOSITION, _header("Accept-Ranges", "`bytes`."))
+LINK = header("Link", 'The next part of the list, as `<address>; rel="next"` (RFC 8288); absent at the end.')
+CONTENT_RANGE = header("Content-Range", "Which bytes of how many.")
+WWW_AUTHENTICATE = header("WWW-Authenticate", "How to show a token.")
+DIGEST = header("Repr-Digest", "SHA-256 of the whole content (RFC 9530).")
+DISPOSITION = header("Content-Disposition", "File name for whoever saves it.")
+CONTENT = (ETAG, DIGEST, DISPOSITION, header("Accept-Ranges", "`bytes`."))
 
 
 def with_headers(status: int, *headers: Header, **further: Any) -> dict[int | str, dict[str, Any]]:

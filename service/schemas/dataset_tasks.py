@@ -11,7 +11,7 @@ from octasplat.workers.db.dataset_tasks import DatasetTask, TaskKind, TaskState
 
 
 class TaskResult(BaseModel):
-    """What an import brought."""
+    """What an import or an upload brought."""
 
     files: int = Field(description="How many files came; `GET .../files` lists them.")
     left_out: list[str] = Field(description="Files that are no part of a scene, a thousand at most.")
@@ -46,7 +46,7 @@ class TaskView(BaseModel):
         description="`queued` waits for its turn, `succeeded` and `failed` never change again. A task goes "
         "on when the service is started again."
     )
-    result: TaskResult | None = Field(description="Of an import that succeeded.")
+    result: TaskResult | None = Field(description="Of an import or an upload that succeeded.")
     problem: ProblemDocument | None = Field(description="Why it failed.")
     created_at: datetime
     started_at: datetime | None

@@ -168,7 +168,7 @@ async def test_import_is_taken_up_by_the_next_front_end_and_forgets_its_address(
         assert again.headers["Location"] == answer.headers["Location"]
         await until(lambda: len(asked) == 1)
         refused = await http.post(f"{dataset}/commit")
-        assert refused.status_code == 409 and "1 imports" in refused.json()["detail"]
+        assert refused.status_code == 409 and "1 imports or uploads" in refused.json()["detail"]
     go_on.set()
     async with connect_service(has_token=False) as (http, service):
         assert (await task_over(http, answer))["state"] == "succeeded" and asked == [url, url]

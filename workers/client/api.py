@@ -158,6 +158,18 @@ class Api:
             if not patience.wait(_retry_after(response)):
                 return self._raise_for_status(response)
 
+    def send(self, method: str, path: str, **arguments: Any) -> httpx.Response:
+        """Send a request once; for what cannot be sent again as it is.
+
+        Raises:
+            ServiceError: it was refused, also because the service is busy.
+            ServiceUnreachableError: a proxy says that the service is away.
+            httpx.TransportError: nobody answers.
+        """
+        response = self._raise_for_status(self._http.request(method, path, **arguments))
+        self._has_answered = True
+        return response
+
     def new_backoff(self) -> Backoff:
         """Return the back-off for an outage of the service that begins now."""
         return Backoff(MAX_OUTAGE_SECONDS if self._has_answered else MAX_FIRST_OUTAGE_SECONDS)

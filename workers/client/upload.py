@@ -7,6 +7,7 @@ import urllib.parse
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.scene_layout import is_ignored_file
 from octasplat.workers.client.api import Api, ServiceError
 from octasplat.workers.client.dataset_tasks import commit
+from octasplat.workers.client.resumable_upload import MIN_RESUMABLE_BYTES, send_resumable
 
 PARALLEL_UPLOADS = 4
 MAX_DELETED_DATASETS = 30
@@ -201,7 +203,11 @@ def _send_missing(
     def send(file: LocalFile) -> None:
         sha256 = _sha256(file.path)
         known = there.get(file.name)
-        if known is None or known["sha256"] != sha256:
+        is_there = known is not None and known["sha256"] == sha256
+        if not is_there and file.size_bytes >= MIN_RESUMABLE_BYTES:
+            with counter.part() as tell:
+                send_resumable(api, dataset_id, file.path, file.name, sha256, tell)
+        elif not is_there:
             _put_file(api, _file_address(dataset_id, file.name), file.path, sha256)
         counter.add(file.size_bytes)
 
@@ -217,7 +223,11 @@ def _send_missing(
 
 def _send_archive(api: Api, dataset_id: str, file: LocalFile, progress: Callable[[int, int], None]) -> None:
     progress(0, file.size_bytes)
-    _put_file(api, f"/v1/datasets/{dataset_id}/archive", file.path, _sha256(file.path))
+    sha256 = _sha256(file.path)
+    if file.size_bytes >= MIN_RESUMABLE_BYTES:
+        send_resumable(api, dataset_id, file.path, None, sha256, lambda done: progress(done, file.size_bytes))
+    else:
+        _put_file(api, f"/v1/datasets/{dataset_id}/archive", file.path, sha256)
     progress(file.size_bytes, file.size_bytes)
 
 
@@ -249,7 +259,23 @@ class _ProgressCounter:
         self._lock = threading.Lock()
         progress(0, total)
 
+    @contextmanager
+    def part(self) -> Iterator[Callable[[int], None]]:
+        """Yield what tells how much of a file has gone out, which counts until the file is there."""
+        told = 0
+
+        def tell(done: int) -> None:
+            nonlocal told
+            self.add(done - told)
+            told = done
+
+        try:
+            yield tell
+        finally:
+            tell(0)
+
     def add(self, count: int) -> None:
+        """Count bytes that have gone out."""
         with self._lock:
             self._done += count
             self._progress(self._done, self._total)

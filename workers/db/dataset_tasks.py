@@ -14,7 +14,7 @@ from octasplat.workers.db.connections import Connection, fetch_all, fetch_one
 from octasplat.workers.db.ids import new_id
 from octasplat.workers.db.postgres_text import as_json
 
-TaskKind = Literal["commit", "import"]
+TaskKind = Literal["commit", "import", "upload"]
 TaskState = Literal["queued", "running", "succeeded", "failed"]
 LOST_SECONDS = 30
 """A task of which nothing was heard for so long is handed out again; its process is gone."""

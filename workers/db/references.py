@@ -8,7 +8,7 @@ from octasplat.workers.storage.fsck import Reference
 
 
 async def references(connection: Connection) -> AsyncIterator[Reference]:
-    """Return the references of dataset files, results, checkpoints, previews and live scenes."""
+    """Return the references of datasets, unfinished uploads, results, checkpoints, previews and live scenes."""
     async with connection.transaction():
         async with connection.cursor("dataset_files") as cursor:
             await cursor.execute("SELECT dataset_id, path, sha256, size_bytes FROM dataset_files")
@@ -16,6 +16,10 @@ async def references(connection: Connection) -> AsyncIterator[Reference]:
                 yield Reference(
                     f"dataset {row['dataset_id']} {row['path']}", row["sha256"], row["size_bytes"]
                 )
+        async with connection.cursor("upload_parts") as cursor:
+            await cursor.execute("SELECT upload_id, sha256, size_bytes FROM upload_parts")
+            async for row in cursor:
+                yield Reference(f"upload {row['upload_id']}", row["sha256"], row["size_bytes"])
         async with connection.cursor("artifacts") as cursor:
             await cursor.execute("SELECT job_id, name, sha256, size_bytes FROM artifacts")
             async for row in cursor:

@@ -17,6 +17,7 @@ from octasplat.workers.db.datasets import get_dataset, reopen_stale_checks
 from octasplat.workers.db.errors import ConflictError
 from octasplat.workers.db.locks import about_to_lock_jobs, lock_owner
 from octasplat.workers.db.sessions import delete_old_sessions
+from octasplat.workers.db.uploads import delete_expired_uploads
 from octasplat.workers.maintenance.webhooks.outbox import purge_deliveries
 from octasplat.workers.queue.jobs import delete_job, get_job
 from octasplat.workers.settings import Retention
@@ -56,7 +57,13 @@ async def apply_retention(pool: Pool, retention: Retention, audit_hours: float) 
         await update_expiry_times(connection, retention)
     async with pool.connection() as connection:
         await delete_expired(connection)
-    for forget in (purge_deliveries, delete_old_idempotency_keys, delete_old_sessions, delete_old_tasks):
+    for forget in (
+        purge_deliveries,
+        delete_old_idempotency_keys,
+        delete_old_sessions,
+        delete_old_tasks,
+        delete_expired_uploads,
+    ):
         async with pool.connection() as connection:
             await forget(connection)
     async with pool.connection() as connection:

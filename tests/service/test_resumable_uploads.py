@@ -1,0 +1,253 @@
+"""A large file goes on after its client, its connection or the service was killed in the middle."""
+
+import asyncio
+import base64
+import hashlib
+import io
+import json
+import subprocess
+import sys
+import threading
+import time
+import zipfile
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import httpx
+import numpy as np
+import psycopg
+import pytest
+from PIL import Image
+
+from octasplat.service.intake import receive
+from octasplat.workers.client.api import Api
+from octasplat.workers.client.upload import upload_scene
+from octasplat.workers.maintenance.garbage_collection import collect_garbage_now
+from octasplat.workers.maintenance.retention import apply_retention
+from octasplat.workers.settings import Retention
+from tests.support.front_end import FrontEnd
+from tests.support.model_builder import ColmapModelBuilder, photographs
+from tests.support.service_harness import ConnectService, client_with_token, task_over
+from tests.support.zip_builder import ZipMember, build_zip
+
+TUS = {"Tus-Resumable": "1.0.0"}
+PART = {**TUS, "Content-Type": "application/offset+octet-stream"}
+PICTURE = next(iter(photographs().values()))
+
+
+def announced(size: int, **told: str) -> dict[str, str]:
+    pairs = (f"{name} {base64.b64encode(value.encode()).decode()}" for name, value in told.items())
+    return {**TUS, "Upload-Length": str(size), "Upload-Metadata": ",".join(pairs)}
+
+
+async def new_dataset(http: httpx.AsyncClient, **headers: str) -> str:
+    return str((await http.post("/v1/datasets", json={"name": "d"}, headers=headers)).headers["Location"])
+
+
+async def new_upload(http: httpx.AsyncClient, dataset: str, content: bytes, **told: str) -> str:
+    answer = await http.post(f"{dataset}/uploads", headers=announced(len(content), **told))
+    assert answer.status_code == 201, answer.text
+    return str(answer.headers["Location"])
+
+
+async def send(http: httpx.AsyncClient, upload: str, offset: int, content: bytes) -> httpx.Response:
+    return await http.patch(upload, content=content, headers={**PART, "Upload-Offset": str(offset)})
+
+
+async def test_file_comes_in_parts_as_tus_has_it(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, _):
+        dataset = await new_dataset(http)
+        digest = hashlib.sha256(PICTURE).hexdigest()
+        upload = await new_upload(http, dataset, PICTURE, path="images/a.png", sha256=digest)
+        half = len(PICTURE) // 2
+        first = await send(http, upload, 0, PICTURE[:half])
+        assert (first.status_code, first.headers["Upload-Offset"]) == (204, str(half))
+        told = await http.head(upload, headers=TUS)
+        assert told.status_code == 200 and told.headers["Cache-Control"] == "no-store"
+        assert (told.headers["Upload-Offset"], told.headers["Upload-Length"]) == (
+            str(half),
+            str(len(PICTURE)),
+        )
+        assert told.headers["Tus-Resumable"] == "1.0.0" and told.headers["Upload-Expires"].endswith("GMT")
+        assert (await http.get(upload)).json()["offset_bytes"] == half
+        assert (await send(http, upload, 0, PICTURE[:half])).status_code == 409
+        assert (await send(http, upload, half, PICTURE)).status_code == 413
+        other = await http.head(upload, headers={"Tus-Resumable": "0.2.2"})
+        assert (other.status_code, other.headers["Tus-Version"]) == (412, "1.0.0")
+        plain = await http.patch(upload, content=b"x", headers={**TUS, "Upload-Offset": str(half)})
+        assert plain.status_code == 415
+        reached = int((await http.head(upload)).headers["Upload-Offset"])
+        last = await send(http, upload, reached, PICTURE[reached:])
+        assert last.status_code == 204 and last.headers["Upload-Offset"] == str(len(PICTURE))
+        task = await task_over(http, httpx.Response(202, headers={"Location": last.headers["Location"]}))
+        assert (task["kind"], task["result"]) == ("upload", {"files": 1, "left_out": [], "notes": []})
+        assert (await http.get(f"{dataset}/files/images/a.png")).content == PICTURE
+        assert (await http.head(upload)).status_code == 404
+
+
+async def test_archive_comes_in_parts_and_is_unpacked(
+    connect_service: ConnectService, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(receive, "PIECE_BYTES", 1000)
+    monkeypatch.setattr(receive, "PART_BYTES", 5000)
+    scene = {**photographs(), **ColmapModelBuilder().files()}
+    archive = build_zip(*(ZipMember(name, content) for name, content in scene.items()))
+    async with connect_service() as (http, service):
+        dataset = await new_dataset(http)
+        upload = await new_upload(http, dataset, archive)
+        last = await send(http, upload, 0, archive)
+        async with service.pool.connection() as connection:
+            cursor = await connection.execute("SELECT count(*) AS n FROM upload_parts")
+            row = await cursor.fetchone()
+        assert row is not None and (row["n"] == 0 or row["n"] >= len(archive) // 5000)
+        task = await task_over(http, httpx.Response(202, headers={"Location": last.headers["Location"]}))
+        assert task["state"] == "succeeded" and task["result"]["files"] == len(scene), task
+        assert (await http.post(f"{dataset}/commit")).status_code == 200
+
+
+async def test_what_has_come_of_a_body_that_breaks_off_is_kept(connect_service: ConnectService) -> None:
+    async def broken() -> AsyncIterator[bytes]:
+        yield b"x" * 1000
+        raise receive.IntakeError(receive.IntakeFault("upload-stalled", "Nothing came."))
+
+    async with connect_service() as (_, service):
+        stored = []
+        with pytest.raises(receive.IntakeError):
+            async for blob in receive.receive_parts(service.storage, broken(), max_bytes=5000):
+                stored.append(blob.size_bytes)
+        assert stored == [1000]
+
+
+async def test_refused_content_is_told_and_its_parts_go(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
+        dataset = await new_dataset(http)
+
+        async def stored_bytes() -> int:
+            return int((await http.get("/v1/usage")).json()["bytes"]["used"])
+
+        for told, content, code in (
+            ({"path": "images/a.png"}, b"no picture", "image"),
+            ({"path": "images/a.png", "sha256": "0" * 64}, PICTURE, "digest-mismatch"),
+            ({}, b"no archive", "archive"),
+        ):
+            upload = await new_upload(http, dataset, content, **told)  # type: ignore[arg-type]
+            last = await send(http, upload, 0, content)
+            task = await task_over(http, httpx.Response(202, headers={"Location": last.headers["Location"]}))
+            assert task["state"] == "failed" and code in task["problem"]["type"], task
+            assert (await http.head(upload)).status_code == 404 and await stored_bytes() == 0
+        for headers in (
+            announced(5, path="../a.png"), announced(0, path="images/a.png"), announced(1 << 50),
+            {**announced(5), "Upload-Metadata": "path !!"}, announced(5, sha256="x"), TUS,
+        ):  # fmt: skip
+            assert (await http.post(f"{dataset}/uploads", headers=headers)).status_code in (413, 422), headers
+        await collect_garbage_now(service.pool, service.storage, every_seconds=0)
+
+
+async def test_parts_count_for_their_owner_and_are_kept_from_collection(
+    connect_service: ConnectService,
+) -> None:
+    async with connect_service(quota_bytes=3000) as (http, service):
+        dataset = await new_dataset(http)
+        content = bytes(2500)
+        upload = await new_upload(http, dataset, content, path="images/a.png")
+        assert (await send(http, upload, 0, content[:2000])).status_code == 204
+        assert (await http.get("/v1/usage")).json()["bytes"]["used"] == 2000
+        too_much = await http.post(f"{dataset}/uploads", headers=announced(2000, path="images/b.png"))
+        assert too_much.status_code == 413
+        async with service.pool.connection() as connection:
+            await connection.execute("UPDATE installation SET collected_at = now() - interval '1 day'")
+        await asyncio.sleep(2.5)  # what is younger is never collected
+        await collect_garbage_now(service.pool, service.storage, every_seconds=0)
+        assert [blob.blob.size_bytes for blob in service.storage.list_blobs()] == [2000]
+        bob = await client_with_token(service, "bob", "write")
+        for answer in (
+            await http.head(upload, headers=bob), await http.delete(upload, headers=bob),
+            await http.patch(upload, content=b"x", headers={**PART, **bob, "Upload-Offset": "2000"}),
+        ):  # fmt: skip
+            assert answer.status_code == 404
+        async with service.pool.connection() as connection:
+            await connection.execute("UPDATE uploads SET expires_at = now() - interval '1 hour'")
+        await apply_retention(service.pool, Retention(), 1000.0)
+        assert (await http.head(upload)).status_code == 404
+        assert (await http.get("/v1/usage")).json()["bytes"]["used"] == 0
+        again = await new_upload(http, dataset, content, path="images/a.png")
+        await send(http, again, 0, content[:10])
+        assert (await http.delete(dataset)).status_code == 204
+        assert (await http.get("/v1/usage")).json()["bytes"]["used"] == 0
+
+
+CLIENT = """
+import json, sys, time
+from pathlib import Path
+from octasplat.workers.client.api import Api
+from octasplat.workers.client.upload import upload_scene
+
+def progress(done, total):
+    print(done, flush=True)
+    time.sleep(0.03)
+
+with Api(sys.argv[1], sys.argv[2]) as api:
+    upload_scene(api, Path(sys.argv[3]), progress=progress)
+"""
+
+
+def large_scene(path: Path) -> int:
+    """A ZIP file of 3 photographs that are noise; returns its length."""
+    rng = np.random.default_rng(0)
+    with zipfile.ZipFile(path, "w") as archive:
+        for number in range(3):
+            content = io.BytesIO()
+            noise = rng.integers(0, 256, (3000, 4000, 3), dtype=np.uint8)
+            Image.fromarray(noise).save(content, "PNG", compress_level=0)
+            archive.writestr(f"images/{number}.png", content.getvalue())
+    return path.stat().st_size
+
+
+def test_upload_goes_on_after_client_and_service_are_killed(
+    conninfo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = tmp_path / "scene.zip"
+    size = large_scene(scene)
+    with FrontEnd(conninfo, tmp_path / "data") as front:
+        command = [sys.executable, "-c", CLIENT, front.address, front.token, str(scene)]
+        client = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        assert client.stdout is not None
+        for line in client.stdout:
+            if int(line) > size // 2:
+                break
+        client.kill()
+        client.wait(60)
+        client.stdout.close()
+        with psycopg.connect(conninfo, autocommit=True) as connection:
+
+            def offset() -> int:
+                row = connection.execute("SELECT offset_bytes FROM uploads").fetchone()
+                return -1 if row is None else int(row[0])
+
+            deadline = time.monotonic() + 30
+            while offset() < size // 3 and time.monotonic() < deadline:
+                time.sleep(0.1)  # until the service knows that nothing more comes
+            kept = offset()
+            assert size // 3 < kept < size
+            told: list[int] = []
+            killed = threading.Event()
+
+            def progress(done: int, _total: int) -> None:
+                told.append(done)
+                time.sleep(0.03)
+                if not killed.is_set() and done > kept + (size - kept) // 2:
+                    killed.set()
+                    front.kill()
+                    threading.Thread(target=front.start).start()
+
+            with Api(front.address, front.token) as api:
+                dataset = upload_scene(api, scene, progress=progress)
+            assert killed.is_set()
+            assert told[1] >= kept  # after the start at 0 it goes on there
+            assert (dataset["state"], dataset["photographs"]) == ("committed", 3)
+            assert offset() == -1
+            row = connection.execute("SELECT sum(size_bytes) FROM dataset_files").fetchone()
+            assert row is not None and size - 1000 < row[0] < size
+        repeats = sum(max(0, before - after) for before, after in zip(told[1:], told[2:], strict=False))
+        assert repeats <= 2 * receive.PART_BYTES, json.dumps({"repeated": repeats, "size": size})
+    monkeypatch.undo()

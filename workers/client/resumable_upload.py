@@ -1,0 +1,113 @@
+"""One large file to a dataset, over breaks of the connection, the service and this process (tus 1.0.0)."""
+
+import base64
+import hashlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import httpx
+
+from octasplat.workers.client.api import (
+    BUSY_STATUSES,
+    UNAVAILABLE_STATUSES,
+    Api,
+    ServiceError,
+    ServiceUnreachableError,
+)
+from octasplat.workers.client.dataset_tasks import wait_for_task
+
+MIN_RESUMABLE_BYTES = 32 << 20
+"""Smaller files are sent in one request, and again from their beginning."""
+REQUEST_BYTES = 256 << 20
+"""Most that one request sends, as proxies limit the time of one."""
+MAX_STORED_BEFORE = 30
+"""So often the same file may have been sent to the same dataset before, and removed there."""
+_PIECE_BYTES = 1 << 20
+_VERSION = {"Tus-Resumable": "1.0.0"}
+_CONFLICT, _NOT_FOUND = httpx.codes.CONFLICT, httpx.codes.NOT_FOUND
+
+
+def send_resumable(
+    api: Api,
+    dataset_id: str,
+    path: Path,
+    name: str | None,
+    sha256: str,
+    progress: Callable[[int], None] = lambda _done: None,
+) -> None:
+    """Send a file and wait until it is stored; the same call again goes on with what has arrived.
+
+    Args:
+        api: the service.
+        dataset_id: where the file belongs.
+        path: the file.
+        name: what it is called there; None for a ZIP file that is unpacked.
+        sha256: its digest.
+        progress: called with the bytes that have gone out.
+
+    Raises:
+        ServiceError: the service refuses it.
+        ServiceUnreachableError: the service was away for too long.
+    """
+    size = path.stat().st_size
+    address = _find_or_create(api, dataset_id, name, sha256, size)
+    patience = api.new_backoff()
+    offset, task = _offset(api, address), None
+    while task is None:
+        progress(offset)
+        headers = {
+            **_VERSION,
+            "Upload-Offset": str(offset),
+            "Content-Type": "application/offset+octet-stream",
+            "Content-Length": str(min(REQUEST_BYTES, size - offset)),
+        }
+        try:
+            response = api.send("PATCH", address, headers=headers, content=_pieces(path, offset, progress))
+        except (httpx.TransportError, ServiceUnreachableError) as error:
+            if not patience.wait():
+                raise api.unreachable_error(error) from None
+            reached = _offset(api, address)
+        except ServiceError as error:
+            # Another connection, perhaps that of before, has brought more; or it is to be repeated.
+            if error.status not in {_CONFLICT, *BUSY_STATUSES, *UNAVAILABLE_STATUSES} or not patience.wait():
+                raise
+            reached = _offset(api, address)
+        else:
+            reached, task = int(response.headers["Upload-Offset"]), response.headers.get("Location")
+        if reached > offset:
+            patience = api.new_backoff()
+        offset = reached
+    wait_for_task(api, api.get(task))
+
+
+def _find_or_create(api: Api, dataset_id: str, name: str | None, sha256: str, size: int) -> str:
+    """Return the address of the upload of this file, a new one unless one is under way."""
+    told = {"sha256": sha256} if name is None else {"path": name, "sha256": sha256}
+    encoded = (f"{key} {base64.b64encode(value.encode()).decode()}" for key, value in told.items())
+    headers = {**_VERSION, "Upload-Length": str(size), "Upload-Metadata": ",".join(encoded)}
+    key = "upload-" + hashlib.sha256(f"{dataset_id}\n{name}\n{sha256}".encode()).hexdigest()
+    for number in range(MAX_STORED_BEFORE):
+        headers["Idempotency-Key"] = f"{key}-{number}"
+        try:
+            response = api.request("POST", f"/v1/datasets/{dataset_id}/uploads", headers=headers)
+        except ServiceError as error:
+            if error.status != _NOT_FOUND:  # it was stored or given up since, and the next one may be there
+                raise
+        else:
+            return str(response.headers["Location"])
+    raise ServiceError(f"The file was sent {MAX_STORED_BEFORE} times before; make a new dataset.")
+
+
+def _offset(api: Api, address: str) -> int:
+    return int(api.request("HEAD", address, headers=_VERSION).headers["Upload-Offset"])
+
+
+def _pieces(path: Path, offset: int, progress: Callable[[int], None]) -> Iterator[bytes]:
+    """Yield the content that one request sends."""
+    end = offset + REQUEST_BYTES
+    with path.open("rb") as handle:
+        handle.seek(offset)
+        while offset < end and (piece := handle.read(min(_PIECE_BYTES, end - offset))):
+            yield piece
+            offset += len(piece)
+            progress(offset)
