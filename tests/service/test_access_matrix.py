@@ -181,7 +181,7 @@ async def test_other_owner_cannot_read_or_change(stage: Stage) -> None:
     before = await stage.everything()
     for operation in operations(APP):
         address, body = await stage.address(operation.path), stage.body(operation)
-        headers = stage.headers["stranger"]
+        headers = stage.headers["stranger"] | operation.needed_headers()
         answer = await stage.http.request(operation.method, address, headers=headers, **body)
         what = f"{operation.name}: {answer.status_code} {answer.text}"
         if operation.name in ADMIN:
@@ -201,7 +201,7 @@ async def test_read_scope_cannot_change(stage: Stage) -> None:
     before = await stage.everything()
     for operation in operations(APP):
         address, body = await stage.address(operation.path), stage.body(operation)
-        headers = stage.headers["reader"]
+        headers = stage.headers["reader"] | operation.needed_headers()
         answer = await stage.http.request(operation.method, address, headers=headers, **body)
         what = f"{operation.name}: {answer.status_code} {answer.text}"
         if (operation.changes and operation.name not in HARMLESS) or operation.name in ADMIN:

@@ -33,6 +33,18 @@ class Operation:
             return {"json": self._example(content["application/json"].get("schema", {}))}
         return {"content": b"x"} if content else {}
 
+    def needed_headers(self) -> dict[str, str]:
+        """Headers without which the request is refused, and the type of a body that is not JSON."""
+        headers = {
+            parameter["name"]: str(self._example(parameter["schema"]))
+            for parameter in self.described.get("parameters", ())
+            if parameter["in"] == "header" and parameter.get("required")
+        }
+        content = self.described.get("requestBody", {}).get("content", {})
+        return headers if not content or "application/json" in content else {
+            **headers, "Content-Type": next(iter(content)),
+        }  # fmt: skip
+
     def _example(self, schema: dict[str, Any]) -> Any:
         while "$ref" in schema:
             schema = self.document["components"]["schemas"][schema["$ref"].rpartition("/")[2]]

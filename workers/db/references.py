@@ -8,7 +8,7 @@ from octasplat.workers.storage.fsck import Reference
 
 
 async def references(connection: Connection) -> AsyncIterator[Reference]:
-    """Return the references of datasets, unfinished uploads, results, checkpoints, previews and live scenes."""
+    """Return the references of datasets, uploads, results, checkpoints, previews and live scenes."""
     async with connection.transaction():
         async with connection.cursor("dataset_files") as cursor:
             await cursor.execute("SELECT dataset_id, path, sha256, size_bytes FROM dataset_files")
