@@ -188,7 +188,9 @@ async def test_recovered_attempt_is_written_down(conninfo: str) -> None:
         job = await fetched(pool, attempt.job.id)
         assert (job.state, job.rescues, job.attempt) == ("queued", 1, 1)
         assert job.slip is not None and job.slip != attempt.job.slip
-        assert await events_of(pool, job, "rescued") == [(1, {"reason": "It is gone.", "rescues": 1})]
+        assert await events_of(pool, job, "rescued") == [
+            (1, {"type": "worker_lost", "reason": "It is gone.", "rescues": 1})
+        ]
         assert (1, "Lost, and queued again: It is gone.") in await log_of(pool, job)
         assert job.waits_for == "It is gone."
         assert 3000 < await delay_of(pool, job) <= 3600
