@@ -24,6 +24,9 @@ from octasplat.engine.trace.protocol import Tracer, TraceResult, TraceSettings
 
 BASE_FEATURE_COUNT = 4
 SHADOW_BIAS_FRACTION = 0.03
+SHADOW_BIAS_DEVIATIONS = 1.5
+"""Where Gaussians are large, so is the roughness of the surface that they are: those beside a lit point reach
+over it by about this many of their standard deviations."""
 RAY_OFFSET_FRACTION = 0.5
 """Rays leave a surface of Gaussians so far above it, of their standard deviations."""
 
@@ -79,7 +82,7 @@ def build_gaussian_layers(
         read_gaussians: reads a file of Gaussians.
         folder: where files are relative to.
         settings: where rays are cut off.
-        size: of the scene, world units; the bias of shadows is 3 % of it unless the stage says else.
+        size: of the scene, world units; see :func:`default_shadow_bias`.
         threads: for building and tracing; 0 takes all.
 
     Raises:
@@ -99,7 +102,7 @@ def build_gaussian_layers(
         surfaces.append(surface)
         on_meshes.append(np.full(len(gaussians), scene.shadows_on_meshes))
         on_gaussians.append(np.full(len(gaussians), scene.shadows_on_gaussians))
-        biases.append(SHADOW_BIAS_FRACTION * size if scene.shadow_bias is None else scene.shadow_bias)
+        biases.append(default_shadow_bias(placed, size) if scene.shadow_bias is None else scene.shadow_bias)
     if not parts:
         return None
     # Channels say nothing of light, and two scenes may mean different things by one name.
@@ -125,6 +128,21 @@ def build_gaussian_layers(
         shadow_bias=max(biases),
         has_material_surfaces=any(surfaces),
     )
+
+
+def default_shadow_bias(gaussians: FlatGaussians, size: float) -> float:
+    """Return how far Gaussians cast no shadow on each other: 3 % of the scene, more where they are large.
+
+    Args:
+        gaussians: as placed.
+        size: of the scene, world units.
+    """
+    if len(gaussians) == 0:
+        return SHADOW_BIAS_FRACTION * size
+    deviations = np.sqrt(gaussians.scales.prod(axis=1))
+    area = np.cumsum((gaussians.opacities * deviations**2)[order := np.argsort(deviations)])
+    typical = float(deviations[order][min(np.searchsorted(area, area[-1] / 2), len(order) - 1)])
+    return max(SHADOW_BIAS_FRACTION * size, SHADOW_BIAS_DEVIATIONS * typical)
 
 
 def place_gaussians(gaussians: FlatGaussians, placement: StageGaussians) -> FlatGaussians:

@@ -224,7 +224,7 @@ class StageGaussians(Transformed):
         shadows_on_gaussians: whether they keep light off the Gaussians. Trained colors hold the scene's
             own shadows already.
         shadow_bias: Gaussians nearer than this to a lit point cast no shadow on it, world units; None takes
-            3 % of the scene's size.
+            3 % of the scene's size, or 1.5 standard deviations of its Gaussians where that is more.
     """
 
     file: str | None = None
