@@ -1,15 +1,19 @@
 """Compose limits what each container may use and reach; systemd and nginx accept their files."""
 
+import json
+import re
 import shutil
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from urllib.request import Request, urlopen
 
+import compose_spec
 import pytest
+import yaml
 
 from tests.docker.test_docker_files import DOCKER, ROOT, compose
 from tests.support.http_server import QuietHandler, serve_http
@@ -50,6 +54,47 @@ def test_kernel_cache_lies_outside_of_the_data_folder() -> None:
     [folder] = [volume.partition(":")[2] for volume in worker["volumes"] if volume.startswith("kernels:")]
     assert f"NUMBA_CACHE_DIR={folder}" in text and not folder.startswith("/data")
     assert f"-m 0711 /data {folder}" in text  # made for the user of the image
+
+
+def with_variables(text: str, given: Mapping[str, str]) -> str:
+    """A compose file with its variables filled in."""
+
+    def value(found: "re.Match[str]") -> str:
+        name, default = found[1], found[3]
+        if found[2] == ":?":
+            assert name in given, f"{name} is needed and not given"
+        return given.get(name, default or "")
+
+    return re.sub(r"(?<!\$)\$\{(\w+)(?:(:[-?])([^}]*))?\}", value, text)
+
+
+def check_compose(text: str) -> None:
+    """Check a compose file by the Compose specification.
+
+    Raises:
+        ValueError: it is refused.
+    """
+    loaded = yaml.safe_load(text)
+    for service in loaded["services"].values():
+        # The library is stricter than Docker here: a number with a point, and no tag beside a digest.
+        service["cpus"] = float(service["cpus"])
+        service["image"] = re.sub(r":[^@]+@", "@", service["image"])
+    compose_spec.PyCompose.from_json(json.dumps(loaded)).validate()
+
+
+def test_compose_file_follows_the_specification() -> None:
+    given = {"OCTASPLAT_TOKEN": "t" * 40, "OCTASPLAT_PASSWORD": "p" * 40}
+    text = with_variables((DOCKER / "compose.yaml").read_text(), given)
+    check_compose(text)
+    for right, wrong in (
+        ("retries: 60", "retires: 60"),
+        ("mem_limit: 2g", "mem_limit: lots"),
+        ("networks: [inside]  # which", "networks: [nowhere]  # which"),
+        ("configs: [{source: s3", "configs: [{source: s4"),
+    ):
+        assert right in text, right
+        with pytest.raises(ValueError, match=r"."):
+            check_compose(text.replace(right, wrong))
 
 
 def test_compose_file_is_accepted() -> None:

@@ -15,6 +15,7 @@ from octasplat.service.settings import ServiceSettings
 
 ROOT = Path(__file__).parents[2]
 DOCKER = ROOT / "docker"
+PINNED = r"[a-z/]+:[0-9][\w.-]*@sha256:[0-9a-f]{64}"
 
 
 def instructions() -> list[tuple[str, str, str]]:
@@ -34,6 +35,14 @@ def instructions() -> list[tuple[str, str, str]]:
 def compose() -> dict[str, Any]:
     loaded: dict[str, Any] = yaml.safe_load((DOCKER / "compose.yaml").read_text())
     return loaded
+
+
+def test_base_image_is_named_by_its_digest() -> None:
+    arguments = dict(rest.split("=", 1) for _, word, rest in instructions() if word == "ARG")
+    bases = [rest.partition(" AS ")[0] for _, word, rest in instructions() if word == "FROM"]
+    stages = {stage for stage, _, _ in instructions()}
+    outside = [base for base in bases if base not in stages]
+    assert outside == ["${PYTHON_IMAGE}"] and re.fullmatch(PINNED, arguments["PYTHON_IMAGE"])
 
 
 def test_dockerfile_is_linted() -> None:
@@ -92,7 +101,7 @@ def test_compose_images_exist_in_dockerfile() -> None:
             assert (ROOT / build["dockerfile"]).is_file()
             assert service["image"] == f"octasplat/{build['target']}"
         else:
-            assert re.fullmatch(r"[a-z/]+:[0-9][\w.-]*", service["image"]), f"{name}: pin a version"
+            assert re.fullmatch(PINNED, service["image"]), f"{name}: name the version and the digest"
         for needed in service.get("depends_on", {}):
             assert needed in services
         for volume in service.get("volumes", []):
