@@ -120,8 +120,11 @@ class Jobs:
             body["files_id"] = await sent(self.http, names)
         made = await self.http.post("/v1/jobs", json=body)
         assert made.status_code == 202, made.text
-        job = made.json()
-        deadline = time.monotonic() + 240
+        return await self.finish(made.json())
+
+    async def finish(self, job: dict[str, Any]) -> str:
+        """The id of a job once it has succeeded."""
+        deadline = time.monotonic() + 500
         while job["state"] in ("queued", "running"):
             assert time.monotonic() < deadline, job
             await asyncio.sleep(0.1)
