@@ -14,6 +14,7 @@ from octasplat.service.actions.task_runner import TaskRunner
 from octasplat.service.audit_middleware import AuditMiddleware
 from octasplat.service.event_broker import EventBroker
 from octasplat.service.eviction import SpaceEvictor
+from octasplat.service.json_bounds import JsonBoundsMiddleware
 from octasplat.service.login_throttle import LoginThrottle
 from octasplat.service.middleware import (
     AllowedHostsMiddleware,
@@ -102,6 +103,7 @@ def create_app(settings: ServiceSettings | None = None) -> FastAPI:
         description=DESCRIPTION,
         lifespan=lifespan,
         generate_unique_id_function=operation_id,
+        openapi_url=None,  # made in a thread, see extend_openapi
         docs_url=None,  # the pages have their own, which needs nothing from elsewhere
         redoc_url=None,
         webhooks=webhook_messages.router,
@@ -119,6 +121,7 @@ def create_app(settings: ServiceSettings | None = None) -> FastAPI:
     add_problem_handlers(app)
     extend_openapi(app)
     app.add_middleware(AuditMiddleware)
+    app.add_middleware(JsonBoundsMiddleware, more_values={scene_previews.PREFIX: scene_previews.MAX_VALUES})
     app.add_middleware(
         BodyLimitMiddleware,
         max_body_bytes=settings.max_body_bytes,

@@ -1,13 +1,16 @@
 """OpenAPI document: that of the routes, with problems and the options of each kind of job."""
 
+import threading
 from typing import Any
 
-from fastapi import FastAPI
+from fastapi import FastAPI, Request
+from fastapi.responses import JSONResponse
 from fastapi.routing import APIRoute
 from pydantic.json_schema import models_json_schema
 
 from octasplat.service.problems import ProblemDocument
 from octasplat.service.request_id import HEADER
+from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
 from octasplat.workers.worker.job_kinds import JobKind, job_kinds
 
 _REF = "#/components/schemas/"
@@ -21,22 +24,32 @@ def operation_id(route: APIRoute) -> str:
 
 
 def extend_openapi(app: FastAPI) -> None:
-    """Add the problem document and the options of jobs to the schemas of ``app``."""
-    original = app.openapi
+    """Add the problem document and the options of jobs to the schemas of ``app``, and an address for all."""
+    original, lock = app.openapi, threading.Lock()
 
     def openapi() -> dict[str, Any]:
-        if app.openapi_schema is None:
-            document = original()
-            schemas = document["components"]["schemas"]
-            schemas["ProblemDocument"] = ProblemDocument.model_json_schema()
-            for name in ("HTTPValidationError", "ValidationError"):
-                schemas.pop(name, None)
-            add_option_schemas(schemas)
-            _add_request_ids(document)
-            app.openapi_schema = document
-        return app.openapi_schema
+        with lock:  # the document is not complete once it is there
+            if app.openapi_schema is None:
+                document = original()
+                schemas = document["components"]["schemas"]
+                schemas["ProblemDocument"] = ProblemDocument.model_json_schema()
+                for name in ("HTTPValidationError", "ValidationError"):
+                    schemas.pop(name, None)
+                add_option_schemas(schemas)
+                _add_request_ids(document)
+                app.openapi_schema = document
+            return app.openapi_schema
+
+    async def read_document(_request: Request) -> JSONResponse:
+        return JSONResponse(await openapi_document(app))
 
     app.openapi = openapi  # type: ignore[method-assign]
+    app.add_route("/openapi.json", read_document, include_in_schema=False)
+
+
+async def openapi_document(app: FastAPI) -> dict[str, Any]:
+    """Return the document, which takes most of a second when it is asked for first, made in a thread."""
+    return await run_in_pool(ThreadPurpose.OPTIONS, app.openapi)
 
 
 def _add_request_ids(document: dict[str, Any]) -> None:

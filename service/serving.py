@@ -5,6 +5,7 @@ On SIGTERM requests under way are finished and streams end.
 
 import asyncio
 import contextlib
+import gc
 import logging
 import socket
 import sys
@@ -116,6 +117,9 @@ def main() -> int:
         log.setLevel(logging.WARNING)
         log.addFilter(RepeatedMessages())
         log.addFilter(lambda _record: _startup_error(app) is None)
+        # What is there for good is not looked through again by each full collection, with the loop held.
+        gc.collect()
+        gc.freeze()
         if is_alone:
             server.on_start = partial(log_missing_capabilities, settings.job_uids)
         with contextlib.suppress(SystemExit):

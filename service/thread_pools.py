@@ -22,6 +22,8 @@ class ThreadPurpose(Enum):
     """Checking datasets; :mod:`octasplat.service.concurrency_limiter` bounds how many at once."""
     OPTIONS = auto()
     """Validating options, a stage's text among them."""
+    BODIES = auto()
+    """Counting what bodies hold before they are parsed."""
     DOWNLOADS = auto()
     """Looking up what is read."""
     STORE_CHECKS = auto()
@@ -33,6 +35,7 @@ _POOL_SIZES = {
     ThreadPurpose.UNPACKING: 3,
     ThreadPurpose.CHECKS: 8,
     ThreadPurpose.OPTIONS: 2,
+    ThreadPurpose.BODIES: 2,
     ThreadPurpose.DOWNLOADS: 12,
     ThreadPurpose.STORE_CHECKS: 4,
 }

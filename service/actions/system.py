@@ -28,19 +28,21 @@ STORAGE_TIMEOUT_SECONDS = 3.0
 """A store that takes longer to answer is not ready."""
 
 
-def list_kinds(service: Service) -> list[KindView]:
+async def list_kinds(service: Service) -> list[KindView]:
     """Return the kinds of jobs with their options."""
-    return [_kind_view(kind, service) for kind in job_kinds()]
+    return await run_in_pool(
+        ThreadPurpose.OPTIONS, lambda: [_kind_view(kind, service) for kind in job_kinds()]
+    )
 
 
-def get_kind(service: Service, name: str) -> KindView:
+async def get_kind(service: Service, name: str) -> KindView:
     """Return one kind of job with its options.
 
     Raises:
         ProblemError: 404 if it does not exist or the principal may not see it.
     """
     try:
-        return _kind_view(get_job_kind(name), service)
+        return await run_in_pool(ThreadPurpose.OPTIONS, _kind_view, get_job_kind(name), service)
     except ConfigError:
         raise not_found_error("kind of job") from None
 

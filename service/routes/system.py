@@ -36,13 +36,13 @@ WorkerName = Annotated[str, Path(max_length=200, description="Name of a live wor
 @router.get("/options", responses=problem_responses())
 async def list_options(_principal: Reader, service: ServiceDep) -> KindList:
     """Return the kinds of jobs with their options as JSON Schema."""
-    return KindList(kinds=actions.list_kinds(service))
+    return KindList(kinds=await actions.list_kinds(service))
 
 
 @router.get("/options/{kind}", responses=problem_responses(404))
 async def get_options(kind: KindName, _principal: Reader, service: ServiceDep) -> KindView:
     """Return one kind of job with its options as JSON Schema."""
-    return actions.get_kind(service, kind)
+    return await actions.get_kind(service, kind)
 
 
 @router.get("/info", responses=problem_responses())

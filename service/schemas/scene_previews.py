@@ -1,7 +1,5 @@
 """What would be taken of a scene, before it is sent."""
 
-from typing import ClassVar
-
 from pydantic import BaseModel, ConfigDict, Field
 
 from octasplat.service.intake.scene_preview import ScenePreview
@@ -26,8 +24,6 @@ class NewScenePreview(RequestBody):
         extra="forbid",
         json_schema_extra={"examples": [{"files": [{"path": "images/0001.jpg", "size_bytes": 123456}]}]},
     )
-
-    max_values: ClassVar[int] = 3 * MAX_LISTED_FILES + 1
 
     files: list[ListedFile] = Field(max_length=MAX_LISTED_FILES)
 

@@ -6,6 +6,7 @@ from typing import Any
 
 from fastapi import APIRouter, Request, Response
 
+from octasplat.service.openapi import openapi_document
 from octasplat.service.web.routing import PageRoute
 from octasplat.service.web.templating import render_page
 
@@ -57,7 +58,7 @@ class OperationGroup:
 @router.get("/docs")
 async def show_api(request: Request) -> Response:
     """Return the page that documents the API."""
-    document = request.app.openapi()
+    document = await openapi_document(request.app)
     return render_page(request, "api.html", groups=operation_groups(document), info=document["info"])
 
 
