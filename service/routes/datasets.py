@@ -54,7 +54,7 @@ Digest = Annotated[
 ]
 
 
-def _binary_body(*media_types: str) -> dict[str, Any]:
+def binary_body(*media_types: str) -> dict[str, Any]:
     """Return the OpenAPI description of a body of bytes."""
     schema = {"type": "string", "format": "binary"}
     content = {name: {"schema": schema} for name in media_types}
@@ -140,7 +140,7 @@ async def list_files(
         200: {"description": "It was there already", "model": FileView},
         **problem_responses(404, 408, 409, 413, 507),
     },
-    openapi_extra=_binary_body("application/octet-stream"),
+    openapi_extra=binary_body("application/octet-stream"),
 )
 async def put_file(
     dataset_id: DatasetId, path: FilePath, principal: Writer, service: ServiceDep, request: Request,
@@ -181,7 +181,7 @@ async def delete_file(dataset_id: DatasetId, path: FilePath, principal: Writer, 
 @router.put(
     "/{dataset_id}/archive",
     responses=problem_responses(404, 408, 409, 413, 507),
-    openapi_extra=_binary_body("application/octet-stream", "application/zip"),
+    openapi_extra=binary_body("application/octet-stream", "application/zip"),
 )
 async def put_archive(
     dataset_id: DatasetId, principal: Writer, service: ServiceDep, request: Request, digest: Digest = None

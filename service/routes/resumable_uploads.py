@@ -17,7 +17,7 @@ from octasplat.service.actions.resumable_uploads import NewUpload
 from octasplat.service.auth import Reader, Writer
 from octasplat.service.problems import ProblemError
 from octasplat.service.routes import problem_responses
-from octasplat.service.routes.datasets import request_body
+from octasplat.service.routes.datasets import binary_body, request_body
 from octasplat.service.routes.parameters import DatasetId, IdempotencyKey
 from octasplat.service.routes.response_headers import LOCATION, header, with_headers
 from octasplat.service.schemas.resumable_uploads import UploadView
@@ -27,7 +27,8 @@ from octasplat.workers.db.uploads import FileUpload
 router = APIRouter(prefix="/v1/datasets", tags=["datasets"])
 
 VERSION = "1.0.0"
-PART_MEDIA_TYPE = "application/offset+octet-stream"
+PART_MEDIA_TYPES = ("application/octet-stream", "application/offset+octet-stream")
+"""Clients of tus send the second; generated ones know the first."""
 UploadId = Annotated[uuid.UUID, Path(description="Id of the upload.")]
 TusVersion = Annotated[
     str | None, Header(alias="Tus-Resumable", max_length=20, description=f"Version of tus: {VERSION}.")
@@ -103,12 +104,7 @@ async def get_upload(
         **with_headers(204, LOCATION, _OFFSET, _EXPIRES, _TUS, description="It is kept"),
         **problem_responses(404, 408, 409, 412, 413, 415, 507),
     },
-    openapi_extra={
-        "requestBody": {
-            "content": {PART_MEDIA_TYPE: {"schema": {"type": "string", "format": "binary"}}},
-            "required": True,
-        }
-    },
+    openapi_extra=binary_body(*PART_MEDIA_TYPES),
 )
 async def continue_upload(
     dataset_id: DatasetId, upload_id: UploadId, principal: Writer, service: ServiceDep, request: Request,
@@ -122,8 +118,8 @@ async def continue_upload(
     With the last byte `Location` names the task that stores the file in the dataset.
     """
     _check_version(version)
-    if request.headers.get("content-type", "").partition(";")[0].strip().lower() != PART_MEDIA_TYPE:
-        raise ProblemError(415, "media-type", f"Send parts of an upload as {PART_MEDIA_TYPE}.")
+    if request.headers.get("content-type", "").partition(";")[0].strip().lower() not in PART_MEDIA_TYPES:
+        raise ProblemError(415, "media-type", f"Send parts of an upload as {PART_MEDIA_TYPES[1]}.")
     upload = await actions.continue_upload(
         service, principal, dataset_id, upload_id, offset_bytes=offset, body=request_body(request)
     )

@@ -66,7 +66,7 @@ def server(conninfo: str, tmp_path: Path) -> Iterator[str]:
 @pytest.fixture
 def document(server: str, tmp_path: Path) -> Path:
     place = tmp_path / "openapi.json"
-    place.write_bytes(httpx.get(f"{server}/openapi.json").raise_for_status().content)
+    place.write_bytes(httpx.get(f"{server}/openapi.json", timeout=60).raise_for_status().content)
     return place
 
 
