@@ -41,12 +41,20 @@ class TaskShares:
         max_running_per_owner: that all work on at once for one owner.
         max_unfinished: that wait or are worked on.
         max_unfinished_per_owner: of those of one owner.
+        crowded_from: with so many under way each further one is of an owner who has none, so that a few
+            owners, whatever they ask of slow addresses, do not hold all.
     """
 
     max_running: int
     max_running_per_owner: int
     max_unfinished: int
     max_unfinished_per_owner: int
+    crowded_from: int | None = None
+
+    def per_owner(self, running: int) -> int:
+        """Return how many of one owner may be under way where so many of all are."""
+        is_crowded = self.crowded_from is not None and running >= self.crowded_from
+        return 1 if is_crowded else self.max_running_per_owner
 
 
 class ServiceSettings(WorkerSettings):
@@ -94,6 +102,7 @@ class ServiceSettings(WorkerSettings):
         max_connections: connections at once; fewer where the process may open few files. Where all are taken,
             a new one replaces the one that has waited longest for a request.
         max_connections_per_address: the same of one address; those of ``proxies`` may have all.
+        import_hosts: hosts of an inner network that files may be imported from, also without TLS.
         header_seconds: how long the headers of a request may take.
         reader_seconds: how long a client may take to read 64 KiB of an answer.
     """
@@ -131,6 +140,7 @@ class ServiceSettings(WorkerSettings):
     max_streams_per_address: int = Field(200, gt=0)
     max_connections: int = Field(4096, gt=0)
     max_connections_per_address: int = Field(1024, gt=0)
+    import_hosts: Annotated[tuple[str, ...], *COMMA_SEPARATED] = ()
     header_seconds: float = Field(20.0, gt=0)
     reader_seconds: float = Field(120.0, gt=0)
 
@@ -167,7 +177,11 @@ class ServiceSettings(WorkerSettings):
     def import_shares(self) -> TaskShares:
         """Return how many imports there may be: connections, not work."""
         return TaskShares(
-            max_running=8, max_running_per_owner=4, max_unfinished=64, max_unfinished_per_owner=16
+            max_running=32,
+            max_running_per_owner=4,
+            max_unfinished=128,
+            max_unfinished_per_owner=16,
+            crowded_from=16,
         )
 
     def upload_shares(self) -> TaskShares:

@@ -47,7 +47,7 @@ async def request_import(
     """
     check_not_draining(service)
     try:
-        check_url(new.url, service.settings.webhook_hosts)
+        check_url(new.url, service.settings.import_hosts)
     except AddressRefusedError as error:
         raise _import_error(str(error), "import-address") from None
     async with service.pool.connection() as connection, connection.transaction():
@@ -91,7 +91,7 @@ async def run_import(service: Service, task: DatasetTask) -> TaskOutcome:
 @asynccontextmanager
 async def _opened(service: Service, principal: Principal, url: str) -> AsyncIterator[httpx.Response]:
     """Open an address, over redirects that are judged as it is."""
-    allowed = service.settings.webhook_hosts
+    allowed = service.settings.import_hosts
     async with guarded_client(allowed) as client:
         for _ in range(MAX_REDIRECTS + 1):
             try:

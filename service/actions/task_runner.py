@@ -76,14 +76,17 @@ class TaskRunner:
 
     async def _begin_tasks(self) -> None:
         for kind, (work, shares) in self._kinds.items():
-            while sum(task.kind == kind for task in self._running.values()) < shares.max_running:
+            while (count := self._count_running(kind)) < shares.max_running:
                 async with self._service.pool.connection() as connection:
-                    task = await rows.claim_task(connection, kind, max_per_owner=shares.max_running_per_owner)
+                    task = await rows.claim_task(connection, kind, max_per_owner=shares.per_owner(count))
                 if task is None:
                     break
                 running = asyncio.create_task(self._work(work, task))
                 self._running[running] = task
                 running.add_done_callback(self._forget)
+
+    def _count_running(self, kind: str) -> int:
+        return sum(task.kind == kind for task in self._running.values())
 
     def _forget(self, running: asyncio.Task[None]) -> None:
         del self._running[running]

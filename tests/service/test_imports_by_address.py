@@ -44,7 +44,7 @@ def elsewhere() -> Iterator[str]:
 
 
 async def test_scene_is_fetched_from_an_address(connect_service: ConnectService, elsewhere: str) -> None:
-    async with connect_service(webhook_hosts=HERE) as (http, _service):
+    async with connect_service(import_hosts=HERE) as (http, _service):
 
         async def fetch(**body: Any):  # type: ignore[no-untyped-def]
             made = (await http.post("/v1/datasets", json={"name": "a"})).json()
@@ -101,8 +101,35 @@ async def test_headers_that_trickle_are_not_waited_for(
     connect_service: ConnectService, elsewhere: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("octasplat.service.actions.imports.HEADER_SECONDS", 0.5)
-    async with connect_service(webhook_hosts=HERE) as (http, _service):
+    async with connect_service(import_hosts=HERE) as (http, _service):
         made = (await http.post("/v1/datasets", json={"name": "a"})).json()
         body = {"url": f"{elsewhere}/trickle"}
         task = await task_over(http, await http.post(f"/v1/datasets/{made['id']}/import", json=body), 20)
         assert task["problem"]["type"] == "urn:octasplat:problem:import"
+
+
+async def test_hosts_of_webhooks_are_no_hosts_of_imports(
+    connect_service: ConnectService, elsewhere: str
+) -> None:
+    """A message goes to them, and nothing of theirs comes back."""
+    async with connect_service(webhook_hosts=HERE) as (http, _service):
+        made = (await http.post("/v1/datasets", json={"name": "a"})).json()
+        body = {"url": f"{elsewhere}/scene.zip"}
+        answer = await http.post(f"/v1/datasets/{made['id']}/import", json=body)
+        assert (answer.status_code, answer.json()["type"]) == (422, "urn:octasplat:problem:import-address")
+
+
+async def test_a_few_owners_with_slow_addresses_do_not_hold_all_imports(
+    connect_service: ConnectService, elsewhere: str
+) -> None:
+    async with connect_service(import_hosts=HERE) as (http, service):
+        for number in range(5):
+            slow = await client_with_token(service, f"slow{number}", "write")
+            for _ in range(6):
+                made = (await http.post("/v1/datasets", json={"name": "a"}, headers=slow)).json()
+                body = {"url": f"{elsewhere}/trickle"}
+                await http.post(f"/v1/datasets/{made['id']}/import", json=body, headers=slow)
+        made = (await http.post("/v1/datasets", json={"name": "a"})).json()
+        answer = await http.post(f"/v1/datasets/{made['id']}/import", json={"url": f"{elsewhere}/scene.zip"})
+        task = await task_over(http, answer, 20)
+        assert task["state"] == "succeeded", task
