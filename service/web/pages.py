@@ -3,6 +3,8 @@
 import json
 import urllib.parse
 import uuid
+from collections.abc import Collection
+from dataclasses import replace
 from typing import Any, Literal
 
 from fastapi import APIRouter, Request, Response
@@ -19,9 +21,10 @@ from octasplat.service.auth import Principal, Reader, Writer
 from octasplat.service.downloads import send_blob
 from octasplat.service.job_limits import limits_by_path
 from octasplat.service.queue_workers import unwritable_formats
-from octasplat.service.schemas.jobs import JobChange, RetryRequest
+from octasplat.service.schemas.jobs import JobChange, JobView, RetryRequest
 from octasplat.service.state import Service, ServiceDep
 from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
+from octasplat.service.web.form_fields import FormField
 from octasplat.service.web.formatting import format_thousands
 from octasplat.service.web.forms import KINDS_WITH_OWN_FORM, options_form
 from octasplat.service.web.job_cameras import viewer_cameras_of_job
@@ -117,6 +120,7 @@ async def show_job(request: Request, job_id: uuid.UUID, principal: Reader, servi
         photograph=preview_path if any(file.path == preview_path for file in photographs) else None,
         further=[options_form(kind, unwritable) for kind in extra] if principal.may("write") else [],
         max_file_bytes=service.settings.max_upload_bytes,
+        go_on=_files_field(detail.line.job, unwritable) if principal.may("write") else None,
     )
 
 
@@ -262,6 +266,15 @@ def _up_world(config: dict[str, object]) -> str:
 def _evaluation_background(config: dict[str, object]) -> object:
     found = _config_value(config, "reconstruction", "evaluation_background")
     return found or _config_value(config, "reconstruction", "evaluate_background") or "black"
+
+
+def _files_field(job: JobView, unwritable: Collection[str]) -> FormField | None:
+    """Return the field of the files that a stopped reconstruction writes, as it would now; else None."""
+    if job.kind != "reconstruct" or job.state not in ("failed", "canceled"):
+        return None
+    form = options_form(get_job_kind(job.kind), unwritable)
+    field = next(field for field in form.first if field.control == "files")
+    return replace(field, default=", ".join(job.options.get("exports") or ()))
 
 
 def _live_count(live: LiveScene | None) -> str:

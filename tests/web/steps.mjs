@@ -288,6 +288,49 @@ const steps = {
         return found;
     },
 
+    /** The pages around jobs at both widths, light and dark; and what a form of a new job says of the presets. */
+    async portraits() {
+        const found = { faults: {} };
+        for (const [name, path] of Object.entries(job.paths)) {
+            found.faults[name] = await portray(path, name, async (page) => {
+                if (!path.startsWith("/new")) return;
+                await page.waitForFunction(() => document.querySelectorAll(".preset-estimate:not(:empty)").length === 4);
+                found.estimates = await page.locator(".preset-estimate").allTextContents();
+                await page.check("[data-path=preset] [value=high]");
+                await page.waitForTimeout(800);
+                found.chosen = await page.textContent("#estimate");
+            });
+        }
+        return found;
+    },
+
+    /** Several archives become a job each. */
+    async many() {
+        const page = await open();
+        await page.goto(`${job.url}/new`);
+        await page.setInputFiles("#pick-files", job.archives);
+        await page.waitForFunction(() => document.getElementById("chosen-text").textContent.includes("2 scenes"));
+        const found = { chosen: await page.textContent("#chosen-text"), notes: await page.locator("#chosen-notes li").allTextContents(), button: await page.textContent("#start") };
+        await page.fill("#label", "evening");
+        await page.check("[data-path=preset] [value=fast]");
+        await page.click("#start");
+        await page.waitForURL(`${job.url}/`);
+        found.names = await page.locator(".job .title a").allTextContents();
+        return found;
+    },
+
+    /** A job that was cancelled goes on with other files to write. */
+    async goOn() {
+        const page = await open();
+        await page.goto(`${job.url}/jobs/${job.job}`);
+        await page.click("#go-on > summary");
+        const box = page.locator("#go-on input[value='scene.spz']");
+        await box.check();
+        await page.click("#go-on [type=submit]");
+        await page.waitForSelector("#status[data-state=queued]");
+        return {};
+    },
+
     /** On a result: a distance, a note that stays, a link to a view, and a crop that is seen and then asked for. */
     async edit() {
         const found = {};

@@ -119,3 +119,57 @@ def test_result_is_measured_annotated_and_cropped(
     assert found["differs"] > 1
     notes = service.request("GET", f"/v1/jobs/{result}")["view_notes"]
     assert [note["text"] for note in notes] == ["the middle <b>"] and len(notes[0]["camera"]) == 6
+
+
+def test_pages_around_jobs_are_accessible_and_presets_say_what_they_take(
+    service: RunningService, browse: Browse, folder: Path, job: uuid.UUID, axe: str
+) -> None:
+    dataset = service.request("GET", f"/v1/jobs/{job}")["dataset_id"]
+    two = [row["id"] for row in service.request("GET", "/v1/jobs?kind=reconstruct")["jobs"]][:2]
+    paths = {
+        "jobs": "/?order=psnr",
+        "new": f"/new?dataset={dataset}",
+        "admin": "/admin",
+        "compare": f"/compare?job={two[0]}&job={two[-1]}",
+    }
+    found = browse("portraits", service.url, paths=paths, axe=axe)
+    assert found["complaints"] == []
+    assert found["faults"] == dict.fromkeys(paths, [])
+    assert all("of memory" in text for text in found["estimates"])
+    assert (
+        found["chosen"].removeprefix("This takes ").split(",")[0]
+        == found["estimates"][2][:1].lower() + (found["estimates"][2][1:].split(",")[0])
+    )
+
+
+def test_several_archives_become_a_job_each(
+    service: RunningService, browse: Browse, folder: Path, tmp_path: Path
+) -> None:
+    archives = [
+        shutil.make_archive(str(tmp_path / name), "zip", folder / "scene") for name in ("gate", "pond")
+    ]
+    found = browse("many", service.url, archives=archives)
+    assert found["complaints"] == []
+    assert (
+        found["chosen"].startswith("2 scenes, a job each, ") and found["button"] == "Upload and start 2 jobs"
+    )
+    assert [note for note in found["notes"] if note.startswith(("gate", "pond"))] == [
+        f"{name}.zip, 9 photographs and a COLMAP model, {note.rpartition(', ')[2]}"
+        for name, note in zip(("gate", "pond"), [n for n in found["notes"] if ".zip" in n], strict=True)
+    ]
+    assert found["names"][:2] == ["evening: pond", "evening: gate"]
+    [newest, *_] = service.request("GET", "/v1/jobs")["jobs"]
+    assert service.request("GET", f"/v1/jobs/{newest['id']}")["options"]["preset"] == "fast"
+
+
+def test_cancelled_job_goes_on_with_other_files(
+    service: RunningService, browse: Browse, folder: Path
+) -> None:
+    command = ("submit", folder / "scene", "--queue", "nobody", "--server", service.url, "-q")
+    done = CliRunner().invoke(cli, [str(part) for part in command], env={"OCTASPLAT_TOKEN": TOKEN})
+    job = done.stdout.strip().splitlines()[-1]
+    service.request("POST", f"/v1/jobs/{job}/cancel")
+    found = browse("goOn", service.url, job=job)
+    assert found["complaints"] == []
+    revised = service.request("GET", f"/v1/jobs/{job}")
+    assert revised["state"] == "queued" and "scene.spz" in revised["options"]["exports"]

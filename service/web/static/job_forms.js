@@ -2,7 +2,7 @@
 
 import { notify } from "./app.js";
 import { SentFiles } from "./form_parts.js";
-import { filesOf, queueJob, readOptions } from "./options.js";
+import { answer, filesOf, queueJob, readOptions } from "./options.js";
 
 for (const form of document.querySelectorAll("form.job-form")) {
     const fault = form.querySelector(".fault"), state = form.querySelector("[role=status]"), button = form.querySelector("[type=submit]");
@@ -27,3 +27,21 @@ for (const form of document.querySelectorAll("form.job-form")) {
         }
     });
 }
+
+/** A stopped reconstruction goes on, and writes other files in the end. */
+document.querySelector("#go-on form")?.addEventListener("submit", async (event) => {
+    event.preventDefault();
+    const form = event.target, fault = form.querySelector(".fault");
+    fault.hidden = true;
+    try {
+        await answer(await fetch(`/v1/jobs/${form.dataset.job}/retry`, {
+            method: "POST",
+            headers: { "Content-Type": "application/json", "Idempotency-Key": crypto.randomUUID?.() ?? String(Math.random()) },
+            body: JSON.stringify({ from: "checkpoint", options: readOptions(form) }),
+        }));
+        location.reload();
+    } catch (error) {
+        fault.textContent = [error.message, ...(error.faults ?? [])].join(" ");
+        fault.hidden = false;
+    }
+});
