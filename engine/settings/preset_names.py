@@ -19,12 +19,12 @@ class PresetWords:
 
 
 PRESET_WORDS: Mapping[PresetName, PresetWords] = {
-    "fast": PresetWords("First look", "a first look, four to ten times faster than standard and less sharp"),
+    "fast": PresetWords("First look", "a first look, the fastest and less sharp than standard"),
     "standard": PresetWords("Standard", "the usual choice, sharp enough for most uses"),
     "high": PresetWords(
         "High detail",
-        "for a final result: a little sharper than standard, in three to four times its time and with more "
-        "Gaussians, where photographs are many and sharp",
+        "for a final result: a little sharper than standard where photographs are many and sharp, slower and "
+        "with more Gaussians",
     ),
     "redisplats": PresetWords(
         "As published",

@@ -110,12 +110,11 @@ def reconstruct(
     Args:
         source: The folder of the photographs, or a video.
         output: Folder for the results.
-        preset: Where the settings of the training come from. fast: a first look, four to ten times
-            faster than standard and less sharp; standard: the usual choice, sharp enough for most uses;
-            high: for a final result: a little sharper than standard, in three to four times its time
-            and with more Gaussians, where photographs are many and sharp; redisplats: the settings that
-            the paper REdiSplats published, to compare with it, for a scene of your own, standard is
-            better. Default: standard.
+        preset: Where the settings of the training come from. fast: a first look, the fastest and less
+            sharp than standard; standard: the usual choice, sharp enough for most uses; high: for a
+            final result: a little sharper than standard where photographs are many and sharp, slower
+            and with more Gaussians; redisplats: the settings that the paper REdiSplats published, to
+            compare with it, for a scene of your own, standard is better. Default: standard.
         max_side: Longest side to which photographs are shrunk; by default they keep their size. Set it
             for a quick try, or where memory is short.
         test_every: Every N-th view by name is held out to be measured; 0 holds out none, so that all
@@ -247,12 +246,11 @@ def estimate(
 
     Args:
         source: The folder of the photographs, or a video, of which no frames are written.
-        preset: Where the settings of the training come from. fast: a first look, four to ten times
-            faster than standard and less sharp; standard: the usual choice, sharp enough for most uses;
-            high: for a final result: a little sharper than standard, in three to four times its time
-            and with more Gaussians, where photographs are many and sharp; redisplats: the settings that
-            the paper REdiSplats published, to compare with it, for a scene of your own, standard is
-            better. Default: standard.
+        preset: Where the settings of the training come from. fast: a first look, the fastest and less
+            sharp than standard; standard: the usual choice, sharp enough for most uses; high: for a
+            final result: a little sharper than standard where photographs are many and sharp, slower
+            and with more Gaussians; redisplats: the settings that the paper REdiSplats published, to
+            compare with it, for a scene of your own, standard is better. Default: standard.
         max_side: Longest side to which photographs are shrunk; by default they keep their size. Set it
             for a quick try, or where memory is short.
         test_every: Every N-th view by name is held out to be measured; 0 holds out none, so that all

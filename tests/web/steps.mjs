@@ -293,6 +293,7 @@ const steps = {
         const found = { faults: {} };
         for (const [name, path] of Object.entries(job.paths)) {
             found.faults[name] = await portray(path, name, async (page) => {
+                if (path.startsWith("/compare")) found.compared = await page.locator("tbody tr").evaluateAll((rows) => rows.map((row) => [...row.cells].map((cell) => cell.textContent.trim())));
                 if (!path.startsWith("/new")) return;
                 await page.waitForFunction(() => document.querySelectorAll(".preset-estimate:not(:empty)").length === 4);
                 found.estimates = await page.locator(".preset-estimate").allTextContents();
@@ -483,7 +484,7 @@ const steps = {
         // Listened for well before the key: a chooser that opens while its interception is being set up is lost.
         const chooser = new Promise((resolve) => page.once("filechooser", resolve));
         await page.goto(`${job.url}/new`);
-        await tabTo(() => document.activeElement.matches("label.button"));
+        await tabTo(() => document.activeElement.matches("[data-pick]"));
         await page.keyboard.press("Enter");
         found.chooser = (await chooser).isMultiple();
         await tabTo(() => document.activeElement.id === "start", 200);

@@ -92,11 +92,7 @@ function show() {
 for (const id of ["pick-folder", "pick-files"]) {
     const input = find(id);
     input.addEventListener("change", () => { if (input.files.length) choose(chosenFiles(input)); });
-    input.parentElement.addEventListener("keydown", (event) => {
-        if (event.key !== "Enter" && event.key !== " ") return;
-        event.preventDefault();
-        input.click();
-    });
+    form.querySelector(`[data-pick=${id}]`).addEventListener("click", () => input.click());
 }
 for (const kind of ["dragenter", "dragover"]) {
     document.addEventListener(kind, (event) => {
@@ -117,7 +113,7 @@ find("forget").addEventListener("click", () => {
     scenes = null;
     show();
     form.querySelectorAll("input[type=file]").forEach((input) => { input.value = ""; });
-    form.querySelector("label.button").focus();
+    form.querySelector("[data-pick]").focus();
 });
 known?.addEventListener("change", () => {
     if (known.value) scenes = null;
