@@ -10,12 +10,14 @@ import pytest
 from octasplat.workers.db.connections import Connection, Pool, open_pool
 from octasplat.workers.db.events_and_logs import list_job_events, list_log_lines
 from octasplat.workers.db.ids import new_id
+from octasplat.workers.db.locks import ROW_SECONDS
 from octasplat.workers.db.rows import Job
 from octasplat.workers.queue import attempts
 from octasplat.workers.queue.attempts import Attempt, claim
 from octasplat.workers.queue.job_endings import recover_attempt
 from octasplat.workers.queue.jobs import cancel_job, get_job
 from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
+from octasplat.workers.queue.protocol import NewEntry
 from octasplat.workers.queue.recovery import StalledAttempts, recover_stalled_jobs
 from tests.support.queue_jobs import SLIPS, claimed, fetched
 
@@ -69,6 +71,16 @@ async def recover(pool: Pool, attempt: Attempt, **options: object) -> bool:
         return await recover_attempt(connection, SLIPS, job, LOST, **options)  # type: ignore[arg-type]
 
 
+async def idle_limit(connection: Connection) -> float:
+    """Return for how many seconds the transaction may be idle; 0 is without end."""
+    cursor = await connection.execute(
+        "SELECT extract(epoch FROM current_setting('idle_in_transaction_session_timeout')::interval) AS s"
+    )
+    row = await cursor.fetchone()
+    assert row is not None
+    return float(row["s"])
+
+
 async def make_old(pool: Pool, job: Job) -> None:
     async with pool.connection() as connection:
         await connection.execute(
@@ -116,6 +128,34 @@ async def test_recovery_passes_over_jobs_that_others_hold(conninfo: str) -> None
             async with asyncio.timeout(SOON_SECONDS):
                 assert await recover_stalled_jobs(pool, SLIPS, 5, StalledAttempts(0.0)) == 1
         assert [(await fetched(pool, a.job.id)).state for a in (held, free)] == ["running", "queued"]
+
+
+async def test_jobs_are_read_without_their_locks(conninfo: str) -> None:
+    async with open_pool(conninfo, max_size=4) as pool:
+        job = (await claimed(pool)).job
+        async with pool.connection() as other, other.transaction(), asyncio.timeout(SOON_SECONDS):
+            usual = await idle_limit(other)
+            assert await get_job(other, job.id) == await fetched(pool, job.id)
+            assert await idle_limit(other) == usual != ROW_SECONDS
+            assert await get_job(other, job.id, lock=True) == await fetched(pool, job.id)
+            assert await idle_limit(other) == ROW_SECONDS
+
+
+async def test_recovery_is_bounded_in_time(conninfo: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its host may vanish while it holds the locks of jobs."""
+    limits: list[float] = []
+    async with open_pool(conninfo, max_size=4) as pool:
+        attempt = await claimed(pool)
+        await make_old(pool, attempt.job)
+        enqueue = ProcrastinateQueue.enqueue
+
+        async def note_limit(queue: ProcrastinateQueue, connection: Connection, entry: NewEntry) -> int:
+            limits.append(await idle_limit(connection))
+            return await enqueue(queue, connection, entry)
+
+        monkeypatch.setattr(ProcrastinateQueue, "enqueue", note_limit)
+        assert await recover_stalled_jobs(pool, SLIPS, 5, StalledAttempts(0.0)) == 1
+    assert limits == [ROW_SECONDS]
 
 
 async def test_recovery_names_the_lost_worker(conninfo: str, caplog: pytest.LogCaptureFixture) -> None:
@@ -183,7 +223,7 @@ async def test_attempts_are_stalled_only_while_they_do_not_change(conninfo: str)
 async def test_recovered_attempt_is_written_down(conninfo: str) -> None:
     async with open_pool(conninfo, max_size=4) as pool:
         attempt, other = await claimed(pool), await claimed(pool)
-        assert not await recover(pool, attempt, delay_seconds=3600.0)
+        assert await recover(pool, attempt, delay_seconds=3600.0) is False
         assert (await fetched(pool, other.job.id)).rescues == 0
         job = await fetched(pool, attempt.job.id)
         assert (job.state, job.rescues, job.attempt) == ("queued", 1, 1)

@@ -205,6 +205,19 @@ async def test_nothing_is_marked_while_contents_are_named(conninfo: str, storage
         await asyncio.wait_for(removal, SOON_SECONDS)
 
 
+async def test_look_does_not_wait_for_a_lease_that_is_about_to_end(
+    conninfo: str, storage: LocalStorage
+) -> None:
+    async with lent(conninfo, storage) as (pool, lease):
+        content = stored(storage)
+        async with pool.connection() as other, other.transaction():
+            await other.execute("DELETE FROM storing WHERE id = %s", [lease.id])
+            async with asyncio.timeout(SOON_SECONDS):
+                await lease.verify([content])
+        with pytest.raises(StorageUnavailableError, match="silent for too long"):
+            await lease.verify([content])
+
+
 async def test_lease_that_is_confirmed_does_not_expire(conninfo: str, storage: LocalStorage) -> None:
     async with lent(conninfo, storage) as (pool, lease):
         content = stored(storage)
