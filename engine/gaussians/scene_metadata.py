@@ -15,7 +15,8 @@ class SceneMetadata:
     Attributes:
         near_world: distance from a camera at which the scene begins to be seen, as in its training.
         pixel_rad: the angle of a pixel in the middle of a training view.
-        turned_beyond: of :class:`octasplat.engine.trace.protocol.TraceSettings`; 0: normals have no side.
+        turned_beyond: ``flip_normal_cos`` of :class:`octasplat.engine.trace.protocol.TraceSettings`; 0:
+            normals have no side. Files have it by this name.
         origin_world: where the scene has its origin in the coordinates of its user, see
             :mod:`octasplat.engine.core.local_origin`.
     """

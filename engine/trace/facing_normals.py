@@ -1,6 +1,6 @@
 """Blended normals, flipped to face the viewer.
 
-Where normals keep their side (``turned_beyond`` of :class:`octasplat.engine.trace.protocol.TraceSettings`),
+Where normals keep their side (``flip_normal_cos`` of :class:`octasplat.engine.trace.protocol.TraceSettings`),
 the blend of a ray that grazes an outline may point a little away from the viewer. No surface that is seen
 does so: it is laid back into the plane across the ray, but for :data:`MIN_VIEW_COSINE`.
 """

@@ -117,7 +117,7 @@ def trace_reference(
     d = torch.tensor(rays.directions_world, dtype=torch.float64)
     o = torch.tensor(rays.origins_world).expand_as(d)
     t_min, t_max = (torch.tensor(limit).expand(len(d))[:, None] for limit in (rays.t_min, rays.t_max))
-    t_viewers = torch.tensor(rays.t_view_origin).expand(len(d))
+    t_view_origins = torch.tensor(rays.t_view_origin).expand(len(d))
     frames = rotation_matrices(p.quats_wxyz)
     r1, r2, r3 = frames.unbind(-1)
     s2, s3 = p.log_scales.exp().unbind(-1)
@@ -155,7 +155,7 @@ def trace_reference(
         alphas = alpha[ray, ids]
         transmittance = torch.cat([alphas.new_ones(1), torch.cumprod(1 - alphas, 0)])
         weight = alphas * transmittance[:-1]  # alpha_k T_k
-        color = _colors(p.sh[ids], to_mean[ray, ids], d[ray], t_viewers[ray])
+        color = _colors(p.sh[ids], to_mean[ray, ids], d[ray], t_view_origins[ray])
         to_means = to_mean[ray, ids].detach()
         cosine_to_mean = (to_means * r1[ids].detach()).sum(-1) / to_means.norm(dim=-1)
         facing = torch.where(cosine_to_mean > settings.flip_normal_cos, -1.0, 1.0)
@@ -185,14 +185,14 @@ def trace_reference(
     )
 
 
-def _colors(sh: Tensor, to_mean: Tensor, direction: Tensor, t_viewer: Tensor) -> Tensor:
+def _colors(sh: Tensor, to_mean: Tensor, direction: Tensor, t_view_origin: Tensor) -> Tensor:
     """Return the colors (n, 3) of the hits of a ray, along the direction from the viewer to each mean.
 
     Seen from infinitely far away, that is the ray's own direction.
     """
     view = direction.expand(len(sh), 3)
-    if t_viewer.isfinite():
-        view = to_mean - t_viewer * view
+    if t_view_origin.isfinite():
+        view = to_mean - t_view_origin * view
     basis = sh_basis(view / view.norm(dim=-1, keepdim=True), sh.shape[1])
     return torch.clamp(0.5 + torch.einsum("nk,nkc->nc", basis, sh), min=0)
 

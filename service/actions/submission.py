@@ -289,10 +289,10 @@ async def _revised_options(
         raise ProblemError(409, "version", detail) from None
     if kind.needs == "result" and job.source_id is None:
         raise ProblemError(409, "source", "The job whose results it works on was deleted; make a new job.")
-    goes_on = request.start == "checkpoint" and job.checkpoint is not None
+    is_resumed = request.start == "checkpoint" and job.checkpoint is not None
     revised = ResolvedOptions(before, job.requested)
     if request.options:
-        revised = await revise_options(kind, revised, request.options, goes_on=goes_on)
+        revised = await revise_options(kind, revised, request.options, is_resumed=is_resumed)
     options = revised.complete
     check_formats_writable(kind, options, job.queue, workers)
     await check_named_files(connection, principal, kind, options, job.files_id)
@@ -305,13 +305,13 @@ async def _revised_options(
     if kind.needs == "dataset" and job.dataset_id is not None:
         dataset = await get_dataset(connection, job.dataset_id)
         options = kind.with_poses_known(options, dataset is not None and dataset.has_poses)
-    if goes_on and not kind.is_resumable_with(before, options):
+    if is_resumed and not kind.is_resumable_with(before, options):
         detail = "With these options the work begins anew; ask for that with from: start."
         raise ProblemError(422, "other-work", detail, errors=[{"pointer": "#/options", "detail": detail}])
     return rows.RevisedOptions(
         options=without_defaults(options),
         requested=with_decisions(kind, revised.requested, revised.complete, options),
-        settings=options.model_dump(mode="json") if goes_on else None,
+        settings=options.model_dump(mode="json") if is_resumed else None,
         estimate=_estimate_as_json(estimate),
     )
 

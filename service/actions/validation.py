@@ -55,7 +55,7 @@ async def resolve_options(kind: JobKind, values: Mapping[str, Any]) -> ResolvedO
 
 
 async def revise_options(
-    kind: JobKind, before: ResolvedOptions, changes: Mapping[str, Any], *, goes_on: bool
+    kind: JobKind, before: ResolvedOptions, changes: Mapping[str, Any], *, is_resumed: bool
 ) -> ResolvedOptions:
     """Return the options of a job that is tried again with changes, validated in a thread.
 
@@ -63,12 +63,12 @@ async def revise_options(
         kind: the kind of the job.
         before: its options.
         changes: what was asked for now.
-        goes_on: whether the job goes on with what it has done, under every setting that is not changed.
+        is_resumed: whether the job goes on with what it has done, under every setting that is not changed.
 
     Raises:
         ProblemError: 422.
     """
-    return await run_in_pool(ThreadPurpose.OPTIONS, _revise, kind, before, changes, goes_on)
+    return await run_in_pool(ThreadPurpose.OPTIONS, _revise, kind, before, changes, is_resumed)
 
 
 def _resolve(kind: JobKind, values: Mapping[str, Any]) -> ResolvedOptions:
@@ -80,14 +80,14 @@ def _resolve(kind: JobKind, values: Mapping[str, Any]) -> ResolvedOptions:
 
 
 def _revise(
-    kind: JobKind, before: ResolvedOptions, changes: Mapping[str, Any], goes_on: bool
+    kind: JobKind, before: ResolvedOptions, changes: Mapping[str, Any], is_resumed: bool
 ) -> ResolvedOptions:
     try:
         revised: BaseModel = kind.revise(before.complete.model_dump(mode="json"), changes)
         if before.requested is None:
             return ResolvedOptions(revised, None)
         requested = kind.revise_requested(before.requested, kind.as_requested(changes))
-        return ResolvedOptions(revised if goes_on else resolve_requested(kind, requested), requested)
+        return ResolvedOptions(revised if is_resumed else resolve_requested(kind, requested), requested)
     except (ValidationError, InvalidSettingsError) as error:
         raise options_error(error) from None
 

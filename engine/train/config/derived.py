@@ -77,7 +77,7 @@ def uses_shared_sort(config: TrainConfig) -> bool:
     return config.shared_sort_until > 0 and not by_geometry and config.trace.second_phase_min is None
 
 
-def ray_patch_side_px(config: TrainConfig, longest_side_px: int, pixels_a_gaussian: float) -> int:
+def ray_patch_side_px(config: TrainConfig, longest_side_px: int, pixels_per_gaussian: float) -> int:
     """Return ``config.ray_patch_side``, or where that is 0 what suits the Gaussians or the views.
 
     A patch is to cover a small angle, so that its rays meet the same Gaussians: what these cost once for all
@@ -88,7 +88,7 @@ def ray_patch_side_px(config: TrainConfig, longest_side_px: int, pixels_a_gaussi
     widest = max(1, round(longest_side_px / MIN_PATCHES_ACROSS))
     if not uses_shared_sort(config):
         return widest
-    return min(widest, max(1, round(math.sqrt(PATCH_PIXELS_PER_GAUSSIAN_PIXEL * pixels_a_gaussian))))
+    return min(widest, max(1, round(math.sqrt(PATCH_PIXELS_PER_GAUSSIAN_PIXEL * pixels_per_gaussian))))
 
 
 def rebuild_interval(rebuild_every: int, gaussians: int) -> int:

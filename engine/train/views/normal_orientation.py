@@ -1,7 +1,7 @@
 """Which side of each Gaussian is its outer one: the side from which the training views see it.
 
 A flat Gaussian has no side of its own. Where one is known, the blend of a ray that grazes an outline can tell
-what has just turned away from the viewer from what has not (``turned_beyond`` of
+what has just turned away from the viewer from what has not (``flip_normal_cos`` of
 :class:`octasplat.engine.trace.protocol.TraceSettings`).
 """
 
