@@ -38,7 +38,9 @@ PYTEST = ("-s", "-p", "no:cacheprovider", "-p", "no:terminal", "-p", "anyio", "-
 MAX_CPU_SECONDS = 120
 """CPU time of one mutant's tests, beyond which it counts as killed; an endless loop takes no less."""
 MAX_SECONDS = 1200.0
-"""Likewise, by the clock."""
+"""Likewise, by the clock, for all tests at once."""
+MIN_SECONDS, MAX_SLOWDOWN = 30.0, 4.0
+"""By the clock, a mutant's tests may take so long, and so many times as long as without a change."""
 
 
 @dataclass(frozen=True)
@@ -338,7 +340,7 @@ def _innermost(value: Any) -> Any:
     return getattr(value, "__func__", value)
 
 
-def _in_fork(work: Callable[[], object]) -> Any:
+def _in_fork(work: Callable[[], object], max_seconds: float = MAX_SECONDS) -> Any:
     """Return what ``work`` returns in a fork, as JSON; None if it takes too long or dies."""
     with tempfile.TemporaryFile() as answer:
         child = os.fork()
@@ -352,7 +354,7 @@ def _in_fork(work: Callable[[], object]) -> Any:
                 answer.flush()
             finally:
                 os._exit(0)
-        deadline = time.monotonic() + MAX_SECONDS
+        deadline = time.monotonic() + max_seconds
         while os.waitpid(child, os.WNOHANG) == (0, 0):
             if time.monotonic() > deadline:
                 os.kill(child, signal.SIGKILL)
@@ -405,7 +407,8 @@ class MutationRun:
                 _exchange_code(ROOT / mutant.path, mutant.source)
                 return self._pass(tests)
 
-            has_survived = not tests or _in_fork(run) is True
+            limit = MIN_SECONDS + MAX_SLOWDOWN * sum(seconds[test.nodeid] for test in tests)
+            has_survived = not tests or _in_fork(run, limit) is True
             counts[mutant.path][has_survived] += 1
             if has_survived:
                 reach = f"{len(tests)} tests" if tests else "no test reaches it"

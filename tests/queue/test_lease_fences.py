@@ -30,6 +30,11 @@ def storage(tmp_path: Path) -> LocalStorage:
     return LocalStorage(tmp_path / "store", floor_bytes=0)
 
 
+@pytest.fixture(autouse=True)
+def bounded_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(storage_leases, "MAX_WAIT_SECONDS", SOON_SECONDS)
+
+
 def stored(storage: LocalStorage, content: bytes = b"x") -> str:
     with storage.open_writer() as writer:
         writer.write(content)
@@ -121,12 +126,22 @@ async def test_wait_for_a_removal_is_bounded(
     conninfo: str, storage: LocalStorage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(storage_leases, "MAX_WAIT_SECONDS", 0.5)
+    monkeypatch.setattr(storage_leases, "_POLL_SECONDS", 0.1)
+    looks: list[object] = []
+    are_being_removed = storage_leases._are_being_removed
+
+    async def look(connection: Connection, contents: list[str] | None) -> bool:
+        looks.append(contents)
+        return await are_being_removed(connection, contents)
+
+    monkeypatch.setattr(storage_leases, "_are_being_removed", look)
     async with lent(conninfo, storage) as (pool, lease):
         content = stored(storage)
         await mark(pool, content)
         async with asyncio.timeout(SOON_SECONDS):
             with pytest.raises(StorageUnavailableError, match="are being removed"):
                 await lease.verify([content])
+    assert 2 <= len(looks) <= 8, "it looks at intervals"
 
 
 async def test_mark_of_a_lost_process_counts_for_a_while(conninfo: str, storage: LocalStorage) -> None:
