@@ -12,9 +12,7 @@ from octasplat.engine.core.events import Event
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.files import read_scene
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.operations.reconstruct import options_from_json
 from octasplat.engine.pipeline import reconstruct
-from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.protocol import Tracer
 from octasplat.service.web.cameras import read_view_poses
@@ -23,6 +21,7 @@ from octasplat.workers.storage.local import LocalStorage
 from octasplat.workers.worker import live_scene
 from octasplat.workers.worker.live_scene import LiveSceneWriter, LiveSceneWritten, heaviest
 from tests.support.tiny_dataset import make_tiny_dataset
+from tests.support.watched_training import watched_config
 
 
 @pytest.fixture(scope="module")
@@ -30,19 +29,10 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_tiny_dataset(tmp_path_factory, width_px=48, height_px=36, points=500)
 
 
-def config() -> ReconstructionConfig:
-    train = {
-        "iterations": 60, "rays_per_batch": 256, "sh_degree": 1, "max_gaussians": 500, "initial_points": 300,
-        "rebuild_every": 20, "checkpoint_every": 1000, "densify_from_iter": 10, "probe_rays": 256,
-        "densify": {"interval": 10, "start": 10},
-    }  # fmt: skip
-    return options_from_json({"preset": "fast", "train": train, "exports": ["mesh.ply"]}).config()
-
-
 def test_states_of_a_training_are_written_with_its_cameras_and_change_nothing(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = reconstruct(scene, tmp_path / "whole", config(), threads=1)
+    whole = reconstruct(scene, tmp_path / "whole", watched_config(), threads=1)
     clock = SimpleNamespace(now=0.0)
     monkeypatch.setattr(live_scene, "time", SimpleNamespace(monotonic=lambda: clock.now))
     monkeypatch.setattr(live_scene, "MAX_GAUSSIANS", 100)
@@ -56,7 +46,7 @@ def test_states_of_a_training_are_written_with_its_cameras_and_change_nothing(
         clock.now += 4.0
         live(iteration, dataset, gaussians)
 
-    reconstruct(scene, run, config(), threads=1, on_step=watch)
+    reconstruct(scene, run, watched_config(), threads=1, on_step=watch)
     steps = [event.step for event in told if isinstance(event, LiveSceneWritten)]
     assert steps[0] == 1 and 10 <= len(steps) <= 16  # every 15 s of 240, later a twentieth of the time
     for name in ("scene.ply", "mesh.ply", "checkpoints/best.npz", "renders/view_000.png"):

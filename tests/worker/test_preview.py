@@ -14,15 +14,14 @@ from octasplat.engine.core.events import Event
 from octasplat.engine.core.rays import ImageRays, RayBatch
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.operations.reconstruct import options_from_json
 from octasplat.engine.pipeline import OnStep, reconstruct
-from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.shading.plain import PLAIN_SHADING
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.protocol import Tracer
 from octasplat.workers.worker import preview
 from octasplat.workers.worker.preview import PreviewRenderer, PreviewWritten
 from tests.support.tiny_dataset import make_tiny_dataset
+from tests.support.watched_training import watched_config
 
 
 class Clock:
@@ -47,15 +46,6 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_tiny_dataset(tmp_path_factory, width_px=48, height_px=36, points=500)
 
 
-def config() -> ReconstructionConfig:
-    train = {
-        "iterations": 60, "rays_per_batch": 256, "sh_degree": 1, "max_gaussians": 500, "initial_points": 300,
-        "rebuild_every": 20, "checkpoint_every": 1000, "densify_from_iter": 10, "probe_rays": 256,
-        "densify": {"interval": 10, "start": 10},
-    }  # fmt: skip
-    return options_from_json({"preset": "fast", "train": train, "exports": ["mesh.ply"]}).config()
-
-
 def watched(clock: Clock, previews: PreviewRenderer, seconds: float) -> OnStep:
     """Every iteration takes so many seconds."""
 
@@ -75,18 +65,18 @@ def told_steps(run: Path, told: list[Event]) -> list[int]:
 
 
 def test_previews_do_not_change_training(scene: Path, tmp_path: Path, clock: Clock) -> None:
-    whole = reconstruct(scene, tmp_path / "whole", config(), threads=1)
+    whole = reconstruct(scene, tmp_path / "whole", watched_config(), threads=1)
     told: list[Event] = []
     run = tmp_path / "run"
     watch = watched(clock, PreviewRenderer(run, "black", told.append), 1.0)
-    reconstruct(scene, run, config(), threads=1, on_step=watch)
+    reconstruct(scene, run, watched_config(), threads=1, on_step=watch)
     # At once, after 4 s, and then every 12 s; one that falls on a densification waits for the next iteration.
     steps = told_steps(run, told)
     assert len(steps) == 6 and steps[0] == 1
     assert all(12 <= b - a <= 14 for a, b in pairwise(steps[1:]))
     drawn_often = tmp_path / "often"
     watch = watched(clock, PreviewRenderer(drawn_often, "black", lambda _event: None), 60.0)
-    reconstruct(scene, drawn_often, config(), threads=1, on_step=watch)
+    reconstruct(scene, drawn_often, watched_config(), threads=1, on_step=watch)
     for name in ("scene.ply", "mesh.ply", "checkpoints/best.npz", "renders/view_000.png"):
         expected = (whole / name).read_bytes()
         assert (run / name).read_bytes() == expected and (drawn_often / name).read_bytes() == expected

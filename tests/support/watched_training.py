@@ -1,0 +1,14 @@
+"""A training of a second that tests watch step by step."""
+
+from octasplat.engine.operations.reconstruct import options_from_json
+from octasplat.engine.runs.config import ReconstructionConfig
+
+
+def watched_config() -> ReconstructionConfig:
+    """Return the settings of 60 iterations on a tiny dataset, growth included."""
+    train = {
+        "iterations": 60, "rays_per_batch": 256, "sh_degree": 1, "max_gaussians": 500, "initial_points": 300,
+        "rebuild_every": 20, "checkpoint_every": 1000, "densify_from_iter": 10, "probe_rays": 256,
+        "densify": {"interval": 10, "start": 10},
+    }  # fmt: skip
+    return options_from_json({"preset": "fast", "train": train, "exports": ["mesh.ply"]}).config()
