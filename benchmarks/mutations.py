@@ -102,7 +102,7 @@ SUBJECTS = {
         shares_fixtures=True,
     ),
     "reference": Subject(
-        {"engine/trace/reference.py": ("trace_reference", "_hit_count")},
+        {"engine/trace/reference.py": ("trace_reference", "_colors", "_hit_count")},
         (
             "tests/trace/test_conformance.py",
             "tests/trace/test_closed_forms.py",

@@ -51,6 +51,11 @@ async def unmark(pool: Pool, *contents: str) -> None:
         await unmark_for_removal(connection, contents)
 
 
+def renewals() -> int:
+    """Return how many leases are being renewed."""
+    return sum("_renew" in repr(task.get_coro()) for task in asyncio.all_tasks())
+
+
 async def make_old(pool: Pool, lease: StorageLease) -> None:
     async with pool.connection() as connection:
         await connection.execute(
@@ -70,7 +75,7 @@ async def lent(conninfo: str, storage: LocalStorage) -> AsyncIterator[tuple[Pool
 
 
 async def test_lease_that_expired_names_nothing(conninfo: str, storage: LocalStorage) -> None:
-    async with lent(conninfo, storage) as (pool, lease):
+    async with lent(conninfo, storage) as (pool, lease), storage_lease(pool, storage) as other:
         content = stored(storage)
         await expire(pool)
         assert await lease.verify([content]) == lease.removals  # it was fresh
@@ -81,6 +86,7 @@ async def test_lease_that_expired_names_nothing(conninfo: str, storage: LocalSto
         for names in (lambda: lease.verify([content]), lambda: lease.reference([content]).__aenter__()):
             with pytest.raises(StorageUnavailableError, match="silent for too long"):
                 await names()
+        await other.verify([content])
 
 
 async def test_lease_that_expires_behind_the_look_names_nothing(
@@ -246,5 +252,8 @@ async def test_leases_end_with_their_block(conninfo: str, storage: LocalStorage)
     async with open_pool(conninfo, max_size=5) as pool:
         async with storage_lease(pool, storage) as lease, storage_lease(pool, storage) as other:
             assert lease.id != other.id
+            await asyncio.sleep(0.1)
+            assert renewals() == 2
         with pytest.raises(StorageUnavailableError):
             await lease.verify([])
+        assert renewals() == 0
