@@ -158,7 +158,8 @@ async def test_mark_of_a_lost_process_counts_for_a_while(conninfo: str, storage:
             await connection.execute("UPDATE removing_contents SET since = since - interval '1 hour'")
         async with asyncio.timeout(SOON_SECONDS):
             await lease.verify([content])
-        await mark(pool, content)  # it counts from now on
+        await mark(pool, content, ABSENT)  # it counts from now on
+        await unmark(pool, ABSENT)
         waiting = asyncio.create_task(lease.verify([content]))
         await asyncio.sleep(0.5)
         assert not waiting.done()
