@@ -28,7 +28,7 @@ _STRING = re.compile(rb'"[^"\\]*+(?:\\.[^"\\]*+)*+(?:"|\\?\Z)', re.DOTALL)
 _LONG_NUMBER = re.compile(rb"[0-9]{%d}" % (MAX_NUMBER_DIGITS + 1))
 _SPACE = re.compile(r"[ \t\n\r]*")
 _NOT_STRUCTURE = bytes(set(range(256)) - set(b"[]{},"))
-_OPENING, _OPENING_OBJECT, _CLOSING = b"[{", ord("{"), b"]}"
+_STARTS, _OBJECT_START, _ENDS = b"[{", ord("{"), b"]}"
 
 
 class JsonBoundsMiddleware(HttpMiddleware):
@@ -100,11 +100,11 @@ def find_excess(body: bytes, max_values: int = MAX_VALUES) -> tuple[str, str] | 
         return too_many
     room = [max_values]  # for further commas, in each container that is open
     for token in structure:
-        if token in _OPENING:
-            room.append(MAX_MEMBERS - 1 if token == _OPENING_OBJECT else max_values)
+        if token in _STARTS:
+            room.append(MAX_MEMBERS - 1 if token == _OBJECT_START else max_values)
             if len(room) > MAX_DEPTH + 1:
                 return "too_deep", f"The request is nested deeper than {MAX_DEPTH} levels."
-        elif token in _CLOSING:
+        elif token in _ENDS:
             if len(room) > 1:
                 room.pop()
         else:

@@ -70,8 +70,8 @@ async def create_upload(
     The same `Idempotency-Key` finds the upload again. For files of some megabytes `PUT .../files` is simpler.
     """
     _check_version(version)
-    told = _parse_metadata(metadata)
-    new = NewUpload(length, told.get("path"), _digest(told.get("sha256")), metadata)
+    fields = _parse_metadata(metadata)
+    new = NewUpload(length, fields.get("path"), _digest(fields.get("sha256")), metadata)
     upload = await actions.create_upload(service, principal, dataset_id, new, idempotency_key=key)
     response.headers.update(_headers(upload))
     response.headers["Location"] = f"/v1/datasets/{dataset_id}/uploads/{upload.id}"
@@ -168,15 +168,15 @@ def _parse_metadata(text: str) -> dict[str, str]:
     Raises:
         ProblemError: 422 if it is not as tus has it.
     """
-    told = {}
+    fields = {}
     for pair in filter(None, (pair.strip() for pair in text.split(","))):
         name, _, value = pair.partition(" ")
         try:
-            told[name] = base64.b64decode(value, validate=True).decode()
+            fields[name] = base64.b64decode(value, validate=True).decode()
         except (binascii.Error, UnicodeDecodeError):
             detail = f"Upload-Metadata: {name[:100]} is no text in Base64."
             raise ProblemError(422, "upload-metadata", detail) from None
-    return told
+    return fields
 
 
 def _digest(sha256: str | None) -> str | None:

@@ -82,8 +82,8 @@ def send_resumable(
 
 def _find_or_create(api: Api, dataset_id: str, name: str | None, sha256: str, size: int) -> str:
     """Return the address of the upload of this file, a new one unless one is under way."""
-    told = {"sha256": sha256} if name is None else {"path": name, "sha256": sha256}
-    encoded = (f"{key} {base64.b64encode(value.encode()).decode()}" for key, value in told.items())
+    metadata = {"sha256": sha256} if name is None else {"path": name, "sha256": sha256}
+    encoded = (f"{key} {base64.b64encode(value.encode()).decode()}" for key, value in metadata.items())
     headers = {**_VERSION, "Upload-Length": str(size), "Upload-Metadata": ",".join(encoded)}
     key = "upload-" + hashlib.sha256(f"{dataset_id}\n{name}\n{sha256}".encode()).hexdigest()
     for number in range(MAX_STORED_BEFORE):

@@ -255,7 +255,7 @@ def _upload_if_needed(api: Api, scene: Path | str, on_event: EventListener, sha2
         return dataset_id
     if isinstance(scene, str) and is_web_address(scene):
         on_event(Noted(f"The service fetches {scene}."))
-        return _told(import_scene(api, scene, sha256=sha256), on_event)
+        return _id_with_notes(import_scene(api, scene, sha256=sha256), on_event)
     with counted_phase("upload", on_event) as progress:
         dataset = upload_scene(
             api,
@@ -263,10 +263,10 @@ def _upload_if_needed(api: Api, scene: Path | str, on_event: EventListener, sha2
             progress=lambda d, t: progress(d >> 10, t >> 10),
             on_warning=lambda sentence: on_event(Warned(sentence)),
         )
-    return _told(dataset, on_event)
+    return _id_with_notes(dataset, on_event)
 
 
-def _told(dataset: dict[str, Any], on_event: EventListener) -> str:
+def _id_with_notes(dataset: dict[str, Any], on_event: EventListener) -> str:
     """Return the id of a dataset whose warnings are told."""
     for warning in dataset["facts"].get("warnings", ()):
         on_event(Warned(warning))

@@ -262,12 +262,12 @@ class _ProgressCounter:
     @contextmanager
     def part(self) -> Iterator[Callable[[int], None]]:
         """Yield what tells how much of a file has gone out, which counts until the file is there."""
-        told = 0
+        reported = 0
 
         def tell(done: int) -> None:
-            nonlocal told
-            self.add(done - told)
-            told = done
+            nonlocal reported
+            self.add(done - reported)
+            reported = done
 
         try:
             yield tell

@@ -147,8 +147,8 @@ class Attempt:
         contents = [scene.sha256, scene.views_sha256]
         async with self._fenced_transaction(lease, contents) as (connection, job):
             await put_live_scene(connection, scene)
-            told = {"step": scene.step, "gaussians": scene.gaussians}
-            await add_event(connection, job.id, job.attempt, "live_scene", told)
+            event_data = {"step": scene.step, "gaussians": scene.gaussians}
+            await add_event(connection, job.id, job.attempt, "live_scene", event_data)
 
     async def record_begun_anew(self, reason: str) -> None:
         """Record why the attempt does not go on from the checkpoint of an earlier one."""
