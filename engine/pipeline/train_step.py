@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from octasplat.engine.core.events import EventListener, Warned
+from octasplat.engine.core.events import EventListener, Noted, Warned
 from octasplat.engine.core.progress import PhaseClock, phase
 from octasplat.engine.core.threads import use_threads
 from octasplat.engine.core.writing import write_json
@@ -39,12 +39,17 @@ from octasplat.engine.train.loop.checkpoint import load_latest_checkpoint, run_f
 from octasplat.engine.train.loop.state import MinScale
 from octasplat.engine.train.loop.time_budget import make_plan, read_plan, write_plan
 from octasplat.engine.train.loop.trainer import Trainer
+from octasplat.engine.train.loop.trial_training import MATERIAL_TRIAL_RAYS, material_gain_db
 from octasplat.engine.train.sampling.pixel_sampler import valid_pixel_fraction
 from octasplat.engine.train.shading_factory import find_background, find_deferred, find_exposures
 from octasplat.engine.train.views.exposure_changes import resolve_exposure
 
 MIN_REFLECTIVE_SHARE = 0.01
 """Share of the surface that must reflect for materials and the environment to be more than guesses."""
+LONG_TRAINING_TRIALS = 8
+"""Trainings of less than so many times the rays of a trial are begun without one."""
+MAX_MATERIAL_LOSS_DB = 1.0
+"""Loss of a trial above which materials are warned of."""
 
 
 class TrainStep:
@@ -107,6 +112,7 @@ def _make_trainer(
     fingerprint = run_fingerprint(dataset, config)
     state = load_latest_checkpoint(folder, fingerprint, progress)
     if state is None:
+        _warn_of_useless_materials(run, config)
         state = initial_train_state(dataset, config, threads=use_threads(run.threads))
         if exposure_changes is not None:
             progress(Warned(f"{exposure_changes} That is learnt; exposure=false leaves it out."))
@@ -134,6 +140,32 @@ def _make_trainer(
         else lambda done, tracer: on_step(done, dataset, tracer, trainer.shading, trainer.state.gaussians),
     )
     return trainer
+
+
+def _warn_of_useless_materials(run: ReconstructionRun, config: TrainConfig) -> None:
+    """Warn before a long training whose photographs plain colors explain better than materials do."""
+    steps = iteration_count(config, run.dataset.train_pixel_count, valid_pixel_fraction(run.dataset))
+    if (
+        not config.materials.learn
+        or steps * config.rays_per_batch < LONG_TRAINING_TRIALS * MATERIAL_TRIAL_RAYS
+    ):
+        return
+    run.progress(Noted("Two short trainings show first whether materials explain these photographs."))
+    gain_db = material_gain_db(
+        run.dataset,
+        background=config.background,
+        seed=config.seed,
+        threads=run.threads,
+        should_stop=run.should_stop,
+    )
+    if gain_db < -MAX_MATERIAL_LOSS_DB:
+        run.progress(
+            Warned(
+                f"In a short training new views are {-gain_db:.1f} dB worse with materials than without: "
+                "little here reflects its surroundings clearly, or they are near. Leave out --materials "
+                "unless the scene is to be lit anew."
+            )
+        )
 
 
 def _prunes_unseen(materials: MaterialSettings) -> bool:

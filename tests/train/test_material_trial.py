@@ -1,0 +1,40 @@
+"""Whether materials are of use is judged by two short trainings, before a long one."""
+
+from pathlib import Path
+
+import pytest
+
+from octasplat.engine.core.events import Event, Noted, Warned
+from octasplat.engine.dataset import Dataset
+from octasplat.engine.pipeline import reconstruct, train_step
+from octasplat.engine.runs.config import resolve_config
+from octasplat.engine.train.loop.trial_training import material_gain_db
+from tests.support.tiny_dataset import make_tiny_dataset
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_tiny_dataset(tmp_path_factory)
+
+
+@pytest.mark.heavy
+def test_materials_of_matt_things_lose_accuracy(scene: Path, tmp_path: Path) -> None:
+    dataset = Dataset.open(scene, tmp_path, max_side=64, test_every=4, threads=2)
+    assert material_gain_db(dataset, background="black", seed=0, threads=2) < -1.0
+
+
+@pytest.mark.parametrize(("gain_db", "share", "told"), [(-4.0, 0, 1), (0.5, 0, 0), (-4.0, 10**9, 0)])
+def test_long_training_with_useless_materials_is_warned_of(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gain_db: float, share: int, told: int
+) -> None:
+    monkeypatch.setattr(train_step, "material_gain_db", lambda *_arguments, **_named: gain_db)
+    monkeypatch.setattr(train_step, "LONG_TRAINING_TRIALS", share)
+    events: list[Event] = []
+    few = ["iterations=2", "rays_per_batch=64", "initial_points=50", "max_gaussians=100", "test_every=4"]
+    config = resolve_config("fast", settings={"exports": ()}, materials=True, assignments=few)
+    reconstruct(scene, tmp_path / "run", config, threads=1, progress=events.append)
+    warned = [event.message for event in events if isinstance(event, Warned)]
+    assert sum("4.0 dB worse with materials than without" in message for message in warned) == told
+    assert any(isinstance(event, Noted) and "short trainings" in event.message for event in events) == (
+        share == 0
+    )
