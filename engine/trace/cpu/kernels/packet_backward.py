@@ -166,11 +166,8 @@ def backward_ray_in_packet(
     the back in float64: as a difference of sums it would drown behind opaque surfaces.
     """
     transmittance_before, weight_gradients = scratch.transmittance_before, scratch.weight_gradients
-    weights, log_alpha_gradients, ray_gradients = (
-        scratch.weights,
-        scratch.log_alpha_gradients,
-        scratch.ray_gradients,
-    )
+    weights, log_alpha_gradients = scratch.weights, scratch.log_alpha_gradients
+    normals, ray_gradients = scratch.normals, scratch.ray_gradients
     features, output_gradients = backward.scene.features, backward.output_gradients
     feature_count = features.shape[1]
     count, start = counts[r], hits.starts[r]
@@ -202,9 +199,7 @@ def backward_ray_in_packet(
                 if output_gradients.has_geometry:
                     weight_gradient += gd * hits.distances[e + k]
                     weight_gradient += (
-                        gn0 * scratch.normals[slot, 0]
-                        + gn1 * scratch.normals[slot, 1]
-                        + gn2 * scratch.normals[slot, 2]
+                        gn0 * normals[slot, 0] + gn1 * normals[slot, 1] + gn2 * normals[slot, 2]
                     )
                 for f in range(feature_count):
                     weight_gradient += (
