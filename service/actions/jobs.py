@@ -29,6 +29,7 @@ from octasplat.workers.db.holds import read_holds
 from octasplat.workers.db.rows import Job, JobState
 from octasplat.workers.queue import jobs as rows
 from octasplat.workers.queue.jobs import JobOrder
+from octasplat.workers.queue.usage_figures import running_by_queue
 from octasplat.workers.worker.job_kinds import get_job_kind
 from octasplat.workers.worker.job_kinds.stored_options import expected_options
 from octasplat.workers.worker.path_redaction import shorten_absolute_paths
@@ -229,7 +230,7 @@ async def job_view(connection: Connection, service: Service, principal: Principa
             if not notes:
                 notes += drained_workers_note(workers, holds.workers, job.queue)
             if not notes:
-                notes += busy_workers_note(workers, await rows.running_by_queue(connection), job.queue)
+                notes += busy_workers_note(workers, await running_by_queue(connection), job.queue)
     return JobView.from_row(
         replace(job, options=complete_options(job)),
         stages_of(job),

@@ -18,8 +18,8 @@ from octasplat.workers.db.holds import set_worker_drained as write_worker_draine
 from octasplat.workers.db.migrate import missing_migrations
 from octasplat.workers.db.rows import WorkerRow
 from octasplat.workers.db.workers import live_workers
-from octasplat.workers.queue.jobs import queue_depths, running_by_queue, running_by_worker
 from octasplat.workers.queue.service_stats import read_service_stats
+from octasplat.workers.queue.usage_figures import queue_depths, running_by_queue, running_by_worker
 from octasplat.workers.sandbox.capabilities import sandbox_capabilities
 from octasplat.workers.storage.errors import StorageError
 from octasplat.workers.worker.job_kinds import JobKind, get_job_kind, job_kinds

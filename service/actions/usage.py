@@ -6,7 +6,7 @@ from octasplat.service.auth import Principal
 from octasplat.service.schemas.usage import UsageView, UsedView
 from octasplat.service.state import Service
 from octasplat.workers.db.quotas import quota_of, usage_of
-from octasplat.workers.queue.jobs import worked_seconds
+from octasplat.workers.queue.usage_figures import worked_seconds
 
 
 async def rate_limit_headers(

@@ -142,7 +142,7 @@ def test_job_of_disconnected_host_is_recovered_by_second_host(two: Hosts, how: s
     job = bench.wait_until_finished(job_id, 120)
     assert (job.state, job.attempt, job.rescues, job.worker) == ("succeeded", 2, 0, "host1")
     events = [
-        {"id": e.id, "kind": e.kind, "attempt": e.attempt, "data": e.data} for e in bench.events(job_id)
+        {"id": e.number, "kind": e.kind, "attempt": e.attempt, "data": e.data} for e in bench.events(job_id)
     ]
     assert journal_faults(events) == []
     resumed = next(event for event in events if event["kind"] == "resumed")

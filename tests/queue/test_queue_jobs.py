@@ -20,10 +20,10 @@ from octasplat.workers.queue.jobs import (
     list_jobs,
     queue_position,
     retry_job,
-    worked_seconds,
 )
 from octasplat.workers.queue.protocol import JobQueue
 from octasplat.workers.queue.recovery import StalledAttempts, recover_stalled_jobs
+from octasplat.workers.queue.usage_figures import worked_seconds
 from tests.support.queue_jobs import NEW, SLIPS, claimed, fetched
 
 

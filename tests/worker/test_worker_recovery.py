@@ -88,8 +88,8 @@ def test_frozen_worker_is_fenced_on_return(bench: WorkerHarness) -> None:
     job = bench.wait_until_finished(job_id)
     assert (job.state, job.attempt, job.worker) == ("succeeded", 2, "second")
     events = bench.events(job_id)
-    taken = next(event.id for event in events if event.data.get("worker") == "second")
-    assert all(event.attempt == 2 for event in events if event.id > taken)
+    taken = next(event.number for event in events if event.data.get("worker") == "second")
+    assert all(event.attempt == 2 for event in events if event.number > taken)
     assert sum(event.data.get("state") == "succeeded" for event in events) == 1
     assert first.poll() is None  # the worker itself is fit for other jobs
 

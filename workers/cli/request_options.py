@@ -1,12 +1,9 @@
 """Options of commands, made from the fields of requests."""
 
 import functools
-import types
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar, get_args, get_origin
 
-import annotated_types
 import click
 from pydantic import BaseModel, BeforeValidator
 from pydantic.fields import FieldInfo
@@ -25,6 +22,13 @@ from octasplat.engine.operations.written_files import remember_written
 from octasplat.engine.settings.fields import Positional, Spelling, is_negatable
 from octasplat.engine.settings.renamed_settings import former_names, notify_renamed
 from octasplat.workers.cli.input_paths import check_inputs
+from octasplat.workers.cli.option_types import (
+    ValueChoice,
+    click_type,
+    is_sequence,
+    plain_click_type,
+    strip_optional,
+)
 from octasplat.workers.cli.options import threads_option
 from octasplat.workers.cli.printing import Printer, output_options
 from octasplat.workers.cli.progress import show_progress
@@ -234,20 +238,20 @@ def _option_decorator(
         hidden: whether the help leaves the option out, which need not be given then.
         former_values: values that the last version had, which are taken, too.
     """
-    inner, optional = _strip_optional(info.annotation)
+    inner, optional = strip_optional(info.annotation)
     if (place := _find_mark(info, Positional)) is not None:
-        many = _is_sequence(inner)
+        many = is_sequence(inner)
         return (
             click.argument(
                 name,
                 metavar=f"{place.metavar}...",
                 nargs=-1,
                 required=info.is_required(),
-                type=_click_type(get_args(inner)[0], None),
+                type=click_type(get_args(inner)[0], None),
             )
             if many
             else click.argument(
-                name, metavar=place.metavar, required=info.is_required(), type=_click_type(inner, info)
+                name, metavar=place.metavar, required=info.is_required(), type=click_type(inner, info)
             )
         )
     spelling = _spelling_of(info)
@@ -265,19 +269,19 @@ def _option_decorator(
         return click.option(*flags, name, type=str, **settings)
     if inner is bool:
         return click.option(*flags, name, is_flag=True, help=settings["help"], default=None, hidden=hidden)
-    if _is_sequence(inner):
+    if is_sequence(inner):
         item = get_args(inner)[0]
         settings["multiple"] = True
         if get_origin(item) is tuple:
-            return click.option(*flags, name, type=tuple(map(_click_type_of, get_args(item))), **settings)
-        return click.option(*flags, name, type=_click_type(item, None), **settings)
+            return click.option(*flags, name, type=tuple(map(plain_click_type, get_args(item))), **settings)
+        return click.option(*flags, name, type=click_type(item, None), **settings)
     if get_origin(inner) is tuple:
         parts = get_args(inner)
         if len(set(parts)) == 1:
-            return click.option(*flags, name, nargs=len(parts), type=_click_type(parts[0], None), **settings)
-        return click.option(*flags, name, type=tuple(map(_click_type_of, parts)), **settings)
-    kind = _click_type(inner, info)
-    if former_values and isinstance(kind, _ValueChoice):
+            return click.option(*flags, name, nargs=len(parts), type=click_type(parts[0], None), **settings)
+        return click.option(*flags, name, type=tuple(map(plain_click_type, parts)), **settings)
+    kind = click_type(inner, info)
+    if former_values and isinstance(kind, ValueChoice):
         kind.also_take(former_values)
     return click.option(*flags, name, type=kind, **settings)
 
@@ -289,7 +293,7 @@ def _is_parsed_from_text(info: FieldInfo) -> bool:
 def _may_repeat(info: FieldInfo) -> bool:
     """Return whether the option may be given several times, so that none at all is an empty tuple."""
     return _spelling_of(info).repeated or (
-        not _is_parsed_from_text(info) and _is_sequence(_strip_optional(info.annotation)[0])
+        not _is_parsed_from_text(info) and is_sequence(strip_optional(info.annotation)[0])
     )
 
 
@@ -297,7 +301,7 @@ def _option_flags(name: str, info: FieldInfo) -> tuple[str, ...]:
     if flags := _spelling_of(info).flags:
         return flags
     flag = "--" + name.replace("_", "-")
-    inner, _ = _strip_optional(info.annotation)
+    inner, _ = strip_optional(info.annotation)
     has_opposite = inner is bool and (info.default is True or is_negatable(info))
     return (f"{flag}/--no-{name.replace('_', '-')}" if has_opposite else flag,)
 
@@ -317,90 +321,6 @@ def _default_metavar(annotation: Any) -> str | None:
     if parts and parts[-1] is not Ellipsis and len(set(parts)) == 1 and len(parts) == 3:
         return "X Y Z"
     return None
-
-
-def _strip_optional(annotation: Any) -> tuple[Any, bool]:
-    """Return the annotation without None and marks, and whether None was in it."""
-    if get_origin(annotation) is Annotated:
-        return _strip_optional(get_args(annotation)[0])
-    if get_origin(annotation) in (Union, types.UnionType):
-        parts = [part for part in get_args(annotation) if part is not type(None)]
-        if len(parts) == 1:
-            inner, _ = _strip_optional(parts[0])
-            return inner, True
-    return annotation, False
-
-
-def _is_sequence(annotation: Any) -> bool:
-    return get_origin(annotation) is tuple and get_args(annotation)[-1] is Ellipsis
-
-
-class _ValueChoice(click.Choice[Any]):
-    """One of several values, which need not be texts."""
-
-    def __init__(self, values: Sequence[Any]) -> None:
-        self._values = {str(value): value for value in values}
-        self._former: frozenset[str] = frozenset()
-        super().__init__(list(self._values))
-
-    def also_take(self, former: Iterable[str]) -> None:
-        """Take words of the last version, which the model reads, without offering them."""
-        self._former = frozenset(former)
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the value that a word stands for."""
-        if value in self._former:
-            return value
-        return self._values[super().convert(str(value), param, ctx)]
-
-
-def _click_type(annotation: Any, info: FieldInfo | None) -> Any:
-    marks: list[Any] = list(info.metadata) if info is not None else []
-    while get_origin(annotation) is Annotated:
-        annotation, *more = get_args(annotation)
-        marks += more
-    if values := _literal_values(annotation):
-        return _ValueChoice(values)
-    if annotation is Path:
-        return click.Path(path_type=Path)
-    if annotation in (int, float):
-        return _number_range(annotation, marks)
-    return annotation if annotation in (str, bool) else str
-
-
-def _literal_values(annotation: Any) -> tuple[Any, ...]:
-    """Return the values of a literal type, or of a union of such; none where it is something else."""
-    if get_origin(annotation) is Literal:
-        return get_args(annotation)
-    if get_origin(annotation) in (Union, types.UnionType):
-        parts = [_literal_values(part) for part in get_args(annotation) if part is not type(None)]
-        return tuple(value for part in parts for value in part) if all(parts) else ()
-    return ()
-
-
-def _click_type_of(annotation: Any) -> Any:
-    return _click_type(annotation, None)
-
-
-def _number_range(kind: type, marks: Sequence[Any]) -> Any:
-    low: Any = None
-    high: Any = None
-    low_open = high_open = False
-    for mark in marks:
-        for part in getattr(mark, "metadata", None) or (mark,):
-            if isinstance(part, annotated_types.Ge):
-                low = part.ge
-            elif isinstance(part, annotated_types.Gt):
-                low, low_open = part.gt, True
-            elif isinstance(part, annotated_types.Le):
-                high = part.le
-            elif isinstance(part, annotated_types.Lt):
-                high, high_open = part.lt, True
-    if low is None and high is None:
-        return kind
-    if kind is int:
-        return click.IntRange(low, high, min_open=low_open, max_open=high_open)
-    return click.FloatRange(low, high, min_open=low_open, max_open=high_open)
 
 
 def _spelling_of(info: FieldInfo) -> Spelling:

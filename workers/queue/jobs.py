@@ -15,7 +15,7 @@ from octasplat.workers.db.ids import new_id
 from octasplat.workers.db.locks import about_to_lock_jobs, lock_owner
 from octasplat.workers.db.postgres_text import as_json, as_json_or_null, storable_text
 from octasplat.workers.db.rows import Artifact, Job
-from octasplat.workers.queue.protocol import JobQueue, NewEntry, QueueDepth
+from octasplat.workers.queue.protocol import JobQueue, NewEntry
 
 JobOrder = Literal["newest", "oldest", "name", "psnr", "longest"]
 """Newest first, oldest first, by name, best PSNR first, longest work first."""
@@ -403,57 +403,6 @@ async def get_artifact(connection: Connection, job_id: uuid.UUID, name: str) -> 
     return await fetch_one(
         connection, Artifact, "SELECT {} FROM artifacts WHERE job_id = %s AND name = %s", [job_id, name]
     )
-
-
-async def queue_depths(connection: Connection, owner: str | None = None) -> list[QueueDepth]:
-    """Return the count of an owner's waiting jobs in each queue that has some; None counts all owners'."""
-    cursor = await connection.execute(
-        """
-        SELECT queue, count(*) AS waiting,
-            extract(epoch FROM now() - min(queued_at))::float8 AS oldest_seconds
-        FROM jobs WHERE state = 'queued' AND (%(owner)s::text IS NULL OR owner = %(owner)s)
-        GROUP BY queue ORDER BY queue
-        """,
-        {"owner": owner},
-    )
-    return [QueueDepth(**row) for row in await cursor.fetchall()]
-
-
-async def running_by_queue(connection: Connection, owner: str | None = None) -> dict[str, int]:
-    """Return the number of an owner's running jobs by queue; None counts all owners'."""
-    cursor = await connection.execute(
-        """
-        SELECT queue, count(*) AS n FROM jobs WHERE state IN ('running', 'canceling')
-          AND (%(owner)s::text IS NULL OR owner = %(owner)s) GROUP BY queue
-        """,
-        {"owner": owner},
-    )
-    return {row["queue"]: row["n"] for row in await cursor.fetchall()}
-
-
-async def running_by_worker(connection: Connection) -> dict[str, int]:
-    """Return the number of running jobs by the name of their worker."""
-    cursor = await connection.execute(
-        """
-        SELECT worker, count(*) AS n FROM jobs
-        WHERE state IN ('running', 'canceling') AND worker IS NOT NULL GROUP BY worker
-        """
-    )
-    return {row["worker"]: row["n"] for row in await cursor.fetchall()}
-
-
-async def worked_seconds(connection: Connection, owner: str) -> float:
-    """Return how long workers took for an owner's jobs, by the newest attempt of each."""
-    cursor = await connection.execute(
-        """
-        SELECT coalesce(sum(extract(epoch FROM coalesce(finished_at, now()) - started_at)), 0)::float8
-            AS seconds
-        FROM jobs WHERE owner = %s AND started_at IS NOT NULL AND state <> 'queued'
-        """,
-        [owner],
-    )
-    row = await cursor.fetchone()
-    return max(0.0, float(row["seconds"])) if row is not None else 0.0
 
 
 async def _get_job_or_raise(connection: Connection, job_id: uuid.UUID, *, lock: bool = False) -> Job:

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 from octasplat.workers.db.connections import Connection
-from octasplat.workers.queue.jobs import queue_depths, running_by_queue
 from octasplat.workers.queue.protocol import QueueDepth
+from octasplat.workers.queue.usage_figures import queue_depths, running_by_queue
 
 TOTAL_NAMES = ("attempts", "rescues", "poisoned", "succeeded", "failed", "canceled")
 
