@@ -22,6 +22,7 @@ def linear_to_srgb(linear: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*s
     array([0. , 0.5, 1. ])
     """
     exponent = linear.dtype.type(1 / 2.4)
+    # where() evaluates both branches: the power of a value below 0 would be not-a-number, with a warning.
     power_segment = 1.055 * np.maximum(linear, 0.0031308) ** exponent - 0.055
     return np.where(linear <= 0.0031308, 12.92 * np.maximum(linear, 0.0), power_segment)
 

@@ -96,6 +96,7 @@ class _Threads:
         self._lock = threading.Lock()
         self._pool: ThreadPoolExecutor | None = None
         self._count = 0
+        # A forked child has none of these threads, and its copy of the lock may be held for good.
         os.register_at_fork(after_in_child=self._forget)
 
     def _forget(self) -> None:
@@ -104,6 +105,7 @@ class _Threads:
     def pool(self, count: int) -> ThreadPoolExecutor:
         with self._lock:
             if self._pool is None or self._count < count:
+                # Calls on a smaller pool end there; its threads stop once nothing refers to it.
                 self._pool, self._count = ThreadPoolExecutor(count, "kernel"), count
             return self._pool
 
@@ -118,6 +120,7 @@ def _call_all(kernel: Callable[..., None], calls: Sequence[tuple[Any, ...]]) -> 
     try:
         kernel(*calls[0])
     finally:
+        # exception() waits: no call may still write into the arrays when an error reaches the caller.
         errors = [error for error in (other.exception() for other in others) if error is not None]
     if errors:
         raise errors[0]

@@ -26,6 +26,7 @@ def begin_compilation() -> None:
         if _under_way > 1:
             return
         _began = time.monotonic()
+    # After the lock is released: a listener may ask for compilation_seconds().
     _tell(Noted(MESSAGE))
 
 

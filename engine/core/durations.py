@@ -18,6 +18,7 @@ def format_duration(seconds: float) -> str:
     >>> format_duration(0.8), format_duration(185), format_duration(3723)
     ('0.8 s', '3:05 min', '1:02:03 h')
     """
+    # Limits at which rounding would give the next form: 9.95 s would be shown as 10.0 s.
     if seconds < 9.95:
         return f"{seconds:.1f} s"
     if seconds < 59.5:

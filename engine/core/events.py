@@ -187,7 +187,7 @@ def read_events(path: Path) -> list[dict[str, object]]:
             try:
                 rows.append(json.loads(line))
             except ValueError:
-                continue
+                continue  # a run that was killed and resumed goes on after a line cut short
     return rows
 
 

@@ -14,6 +14,7 @@ def hashed_uniforms(*keys: UInt64[np.ndarray, " n"]) -> Float64[np.ndarray, "2 n
     state = splitmix64(keys[0])
     for key in keys[1:]:
         state = splitmix64(state + key)
+    # The upper 53 bits: as many as a double holds exactly
     return np.stack([(x >> np.uint64(11)) * 2.0**-53 for x in (state, splitmix64(state))])
 
 

@@ -53,7 +53,7 @@ def _folder_of(module: str) -> str:
     """Return the folder from which a module is imported; empty if there is no such module or folder."""
     try:
         spec = importlib.util.find_spec(module)
-    except (ImportError, ValueError):
+    except (ImportError, ValueError):  # ValueError: a module without a spec, as __main__ can be
         return ""
     if spec is None or spec.origin is None or not Path(spec.origin).is_file():
         return ""

@@ -69,6 +69,7 @@ class _SharedCache(FunctionCache):  # type: ignore[misc]
         _pause_collector()
         begin_compilation()
         self._take_lock()
+        # Again, now with the lock: another process may have kept the code while this one waited for it.
         return super().load_overload(sig, target_context)
 
     def _load_overload(self, sig: Any, target_context: Any) -> Any:
@@ -86,6 +87,7 @@ class _SharedCache(FunctionCache):  # type: ignore[misc]
         if not self._is_compiling:
             return
         self._is_compiling = False
+        # The file stays: were it removed, two processes could hold locks on different files of this name.
         if self._lock is not None:
             self._lock.close()
             self._lock = None
@@ -129,12 +131,13 @@ def share_compilation(dispatcher: Any) -> Any:
     A compilation makes millions of objects that live to its end; looking through them takes a fifth of it.
     """
     cache = _SharedCache(dispatcher.py_func)
-    dispatcher._cache = cache
+    dispatcher._cache = cache  # in place of the one that cache=True gave it
     compile_overload: Callable[[Any], Any] = dispatcher.compile
 
     def compile_once(signature: Any) -> Any:
         try:
             return compile_overload(signature)
+        # Also after a failed compilation, or other processes would wait until this one ends.
         finally:
             cache.release()
 
@@ -168,4 +171,5 @@ class _ContentLocator(_CacheLocator):  # type: ignore[misc]
         return locator
 
 
+# First of all, as numba takes the first locator that answers
 CacheImpl._locator_classes.insert(0, _ContentLocator)

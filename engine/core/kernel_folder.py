@@ -23,6 +23,7 @@ _NOT_IN_THE_CODE = {
     f"{PACKAGE}.engine.core.{name}" for name in ("kernel_cache", "kernel_folder", "compiling")
 }
 """Modules that keep machine code and decide nothing about it."""
+# Imports are found in the text, as importing the modules would import numba.
 _IMPORT = re.compile(
     rf"^\s*(?:from\s+({PACKAGE}[\w.]*)\s+import\s+(\([^)]*\)|[^\n(]+)|import\s+({PACKAGE}[\w.]+))",
     re.MULTILINE,
@@ -76,6 +77,7 @@ def _is_usable(folder: Path) -> bool:
     """Return whether this process, and nobody else but root, may keep code in ``folder``."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        # Only writing shows whether it works: the permissions say nothing of a file system mounted read-only.
         with tempfile.TemporaryFile(dir=folder):
             pass
         owner = folder.stat()
@@ -83,6 +85,7 @@ def _is_usable(folder: Path) -> bool:
         return False
     if not hasattr(os, "getuid"):
         return True
+    # Kept code is run when it is loaded, so that whoever may write here could have this process run theirs.
     return owner.st_uid in (0, os.getuid()) and not owner.st_mode & stat.S_IWOTH
 
 
@@ -107,6 +110,7 @@ def cache_folder() -> Path:
     user = os.getuid() if hasattr(os, "getuid") else 0
     private = Path(tempfile.gettempdir()) / f"{PACKAGE}-kernels-{user}"
     if not _is_private(private):
+        # the name is taken by another user, or open to others
         private = Path(tempfile.mkdtemp(prefix=f"{PACKAGE}-kernels-"))
     if readable_cache_folder() is not None:
         return private
@@ -167,7 +171,7 @@ def _is_private(folder: Path) -> bool:
     """Make ``folder`` for this user alone; whether it is this user's alone."""
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
-        found = folder.lstat()
+        found = folder.lstat()  # not stat(): another user may have put a link there
     except OSError:
         return False
     mine = not hasattr(os, "getuid") or found.st_uid == os.getuid()

@@ -33,6 +33,7 @@ def choose_origin(centre: Float[np.ndarray, "3"], extent: float) -> Origin:
     """
     if not (np.isfinite(centre).all() and extent > 0 and np.linalg.norm(centre) > MAX_DISTANCE * extent):
         return NO_ORIGIN
+    # A power of ten no larger than the extent: rounding moves the origin by at most half an extent an axis.
     step = 10.0 ** np.floor(np.log10(extent))
     x, y, z = (np.rint(np.asarray(centre, np.float64) / step) * step).tolist()
     return (x, y, z)
@@ -85,6 +86,7 @@ def vertices_about(vertices: Float64[np.ndarray, "v 3"], origin: Origin) -> Floa
         return vertices
     centre = np.median(vertices, axis=0)
     values = np.array(origin)
+    # All 48 signed permutations of the axes, as files differ in what is up and in handedness
     turned = [
         np.array(signs) * values[list(order)]
         for order in itertools.permutations(range(3))
@@ -100,6 +102,7 @@ def local_map(
 ) -> Float64[np.ndarray, "4 4"]:
     """Return an affine map of user coordinates as a map between points relative to two local origins."""
     local = np.array(matrix, np.float64)
+    # x' + new_origin = A (x + origin) + t
     local[:3, 3] += local[:3, :3] @ np.array(origin) - np.array(new_origin)
     return local
 
@@ -115,7 +118,7 @@ def origin_after(
         origin: the local origin before.
     """
     linear = np.asarray(matrix, np.float64)[:3, :3]
-    carried = linear @ np.array(origin) + matrix[:3, 3]
+    carried = linear @ np.array(origin) + matrix[:3, 3]  # where the map takes the old local origin
     moved = np.asarray(points, np.float64) @ linear.T
     centre = np.median(moved, axis=0)
     extent = float(np.median(np.linalg.norm(moved - centre, axis=1)))

@@ -28,6 +28,7 @@ TYPE_NAMES: Mapping[str, str] = {
 }  # fmt: skip
 COUNT_SUFFIX = "__count"
 """A list property ``p`` becomes two fields: ``p`` itself and ``p`` + this, its length."""
+# Far more than any program writes: a damaged header must not take all memory.
 MAX_HEADER_BYTES = 1 << 20
 MAX_ELEMENTS, MAX_PROPERTIES = 100, 10_000
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
@@ -115,7 +116,7 @@ def _parse_header(path: Path, handle: IO[bytes]) -> PlyHeader:
         line = handle.readline(MAX_HEADER_BYTES)
         if not line.endswith(b"\n"):
             break
-        text = line.decode("utf-8", errors="replace").strip()
+        text = line.decode("utf-8", errors="replace").strip()  # comments may be in any encoding
         if text == "end_header":
             if not draft.layout:
                 raise SceneFileError(f"{path}: the PLY header has no 'format' line.")
@@ -224,7 +225,7 @@ def _binary_tables(path: Path, header: PlyHeader) -> Iterator[tuple[str, np.ndar
         if offset + needed > size:
             raise _truncated_error(path, element, max(0, size - offset) // max(1, dtype.itemsize))
         table: np.ndarray
-        if needed:
+        if needed:  # an empty range cannot be mapped
             table = np.memmap(path, dtype=dtype, mode="c", offset=offset, shape=(element.count,))
         else:
             table = np.zeros(element.count, dtype=dtype)
@@ -244,7 +245,9 @@ def _first_lengths(path: Path, element: PlyElement, byte_order: str, offset: int
                 raw = handle.read(count_type.itemsize)
                 if len(raw) < count_type.itemsize:
                     raise _truncated_error(path, element, 0)
+                # a negative count fails in _check_lengths
                 lengths[prop.name] = max(0, int(np.frombuffer(raw, dtype=count_type)[0]))
+                # Before a row type of this length is made, which numpy would refuse with an error of its own
                 if lengths[prop.name] > path.stat().st_size:
                     raise _truncated_error(path, element, 0)
                 handle.seek(lengths[prop.name] * np.dtype(prop.kind).itemsize, 1)

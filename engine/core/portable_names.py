@@ -15,6 +15,7 @@ MAX_COMPONENT_BYTES = 240
 MAX_DEPTH = 12
 
 _SHOWN_NAMES = 3
+# Windows reserves these with any suffix or spaces after them, and takes superscript digits for 1 to 3.
 _RESERVED_NAMES = re.compile(
     r"(con|prn|aux|nul|conin\$|conout\$|clock\$|(com|lpt)[0-9\u00b9\u00b2\u00b3]) *(\..*)?",
     re.IGNORECASE | re.DOTALL,
@@ -102,6 +103,7 @@ def _check_component(component: str, quoted: str) -> None:
             "name-traversal",
             f"The file name {quoted} contains '{component}' as a part, which may lead elsewhere.",
         )
+    # Windows drops a dot or a space at the end, so that two names would be one file.
     if component.endswith((".", " ")) or component.startswith(" "):
         raise FileNameError(
             "name-trailing",
@@ -119,6 +121,7 @@ def _check_component(component: str, quoted: str) -> None:
 
 def collision_key(name: str) -> str:
     """Return the key that names share which some file system treats as equal: NFC without case."""
+    # Canonical caseless matching (Unicode, D145): folding the case can undo a normal form.
     return unicodedata.normalize(
         "NFC", unicodedata.normalize("NFD", unicodedata.normalize("NFD", name).casefold())
     )

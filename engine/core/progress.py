@@ -65,6 +65,7 @@ def phase(name: str, progress: EventListener, steps: int = 0) -> Iterator[PhaseC
     progress(PhaseStarted(name, steps))
     clock = PhaseClock()
     yield clock
+    # Not in a finally clause: a phase that raised an error has not finished.
     progress(PhaseFinished(name, clock.stop()))
 
 

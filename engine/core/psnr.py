@@ -55,8 +55,10 @@ def fit_color(
     for channel in range(3):
         x, y = render[..., channel].astype(np.float64), reference[..., channel].astype(np.float64)
         x_mean, y_mean = np.average(x, weights=weight), np.average(y, weights=weight)
+        # About the mean, so that the offset is the mean of the reference
         x -= x_mean
         variance = np.average(x * x, weights=weight)
+        # A channel of one value says nothing of the gain.
         gain = np.average(x * (y - y_mean), weights=weight) / variance if variance > 0 else 0.0
         corrected[..., channel] = np.clip(gain * x + y_mean, 0.0, 1.0)
     return corrected

@@ -78,6 +78,7 @@ class RayBatch:
         >>> rays.directions_world.tolist(), rays.t_max.tolist()
         ([[0.0, 0.0, 1.0]], [3.0])
         """
+        # From the start as it is stored, in 32 bits: only so does the ray lead to the end.
         ways = np.asarray(ends_world, np.float64) - np.asarray(starts_world, np.float32)
         lengths = np.linalg.norm(ways, axis=1)
         ways[lengths == 0] = (0.0, 0.0, 1.0)
@@ -132,6 +133,7 @@ class RayBatch:
         normal = np.asarray(normal_world, np.float64)
         normal = normal / np.linalg.norm(normal)
         origins, directions = self.origins_world.astype(np.float64), self.directions_world.astype(np.float64)
+        # Householder reflection at the plane: x - 2 ((x - p) . n) n
         origins -= 2 * ((origins - point_world) @ normal)[:, None] * normal
         directions -= 2 * (directions @ normal)[:, None] * normal
         return RayBatch(
@@ -202,4 +204,5 @@ class ImageRays:
 
 def _for_kernels(values: Float[np.ndarray, "..."]) -> Float32[np.ndarray, "..."]:
     """Return ``values`` in the array layout that kernels are compiled for, copied only where needed."""
+    # Writable too: numba takes a read-only array for another type, and would compile the kernel again.
     return np.require(values, np.float32, ["C", "W"])

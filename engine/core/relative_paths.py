@@ -15,6 +15,7 @@ def check_relative_path(name: str) -> str:
     """
     paths = (PurePosixPath(name), PureWindowsPath(name))
     climbs = any(".." in path.parts for path in paths)
+    # On Windows "C:a" and "\a" are not absolute, but lead out of the folder all the same.
     elsewhere = any(path.is_absolute() or path.drive or path.root for path in paths)
     if not name or not any(path.name for path in paths) or climbs or elsewhere or "\0" in name:
         raise ValueError(f"{name[:60]!r} is no path below the folder of the file")

@@ -41,6 +41,7 @@ _MODEL_FILE = re.compile(
 _POSES_FILE = re.compile(r"transforms(_train|_test|_val)?\.json")
 _POINTS_FILE = re.compile(r"[^/]+\.ply", re.IGNORECASE)
 _MODEL_ELSEWHERE = re.compile(r"(.*/)?images\.(bin|txt)")
+# "Icon\r" is the icon of a folder on macOS; "." and ".." are not hidden files.
 _IGNORED_FILE = re.compile(
     r"(^|/)(__MACOSX/|\.(?!\.?(/|$))[^/]*|thumbs\.db$|desktop\.ini$|Icon\r?$)", re.IGNORECASE
 )

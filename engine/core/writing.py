@@ -40,9 +40,11 @@ def atomic_replace(path: Path) -> Iterator[Path]:
     """
     with report_disk_full(path):
         path.parent.mkdir(parents=True, exist_ok=True)
+        # The process id keeps two processes apart that write the same file.
         temporary = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
         try:
             yield temporary
+            # Content before name: after a power failure the file is the old or the new one, never empty.
             with temporary.open("rb") as handle:
                 os.fsync(handle.fileno())
             temporary.replace(path)

@@ -62,7 +62,7 @@ class Camera:
         """Return the angle of a pixel at the image centre; 0 where the model has no rays there."""
         x, y = self.width_px / 2, self.height_px / 2
         ways = self.directions_cam(np.array([[x, y], [x + 1, y]]))
-        angle = float(np.linalg.norm(np.cross(ways[0], ways[1])))
+        angle = float(np.linalg.norm(np.cross(ways[0], ways[1])))  # the sine, for so small an angle
         return angle if np.isfinite(angle) else 0.0
 
     @property
@@ -94,6 +94,7 @@ class Camera:
                 0, _TWO_FOCAL_MODELS[self.model], f, self.width_px, self.height_px
             )
             params = [f, f, cx, cy, *extra]
+            # Terms of distortion that only the sibling has are 0.
             camera.params = params + [0.0] * (len(camera.params) - len(params))
         camera.rescale(width_px, height_px)
         return Camera(camera.model_name, tuple(float(p) for p in camera.params), width_px, height_px)
@@ -122,6 +123,7 @@ class Camera:
         misses_px = np.abs(np.asarray(camera.img_from_cam(directions)).reshape(-1, 2) - points).max(
             axis=1, initial=0.0
         )
+        # Negated, as a projection that is not-a-number must count as a miss
         directions[~(misses_px <= ROUND_TRIP_TOLERANCE_PX)] = np.nan
         return directions
 

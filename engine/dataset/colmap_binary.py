@@ -30,6 +30,7 @@ def check_binary_colmap_model(folder: Path) -> None:
         if not path.exists():
             continue
         try:
+            # an empty file cannot be mapped
             data = path.read_bytes() if path.stat().st_size < 4096 else _memory_map(path)
             end = walk(data, path)
         except (struct.error, OverflowError):
@@ -78,8 +79,9 @@ def _by_id(
 
 def _read_cameras(data: bytes, path: Path) -> Iterator[tuple[int, CameraRecord]]:
     names = {int(model): name for name, model in pycolmap.CameraModelId.__members__.items()}
-    position = 8
+    position = 8  # behind the number of records
     for _ in range(_unpack("Q", data, 0)[0]):
+        # CAMERA_ID, MODEL_ID, WIDTH, HEIGHT
         camera_id, model, width, height = _unpack("IiQQ", data, position)
         count = len(pycolmap.Camera.create_from_model_name(0, names[model], 1.0, 1, 1).params)
         params = _unpack(f"{count}d", data, position + 24)
@@ -91,6 +93,7 @@ def _read_images(data: bytes, path: Path) -> Iterator[tuple[int, ImageRecord]]:
     shown = np.dtype([("px", "<f8", 2), ("point", "<i8")])
     position = 8
     for _ in range(_unpack("Q", data, 0)[0]):
+        # IMAGE_ID, rotation, translation, CAMERA_ID
         image_id, *numbers, camera_id = _unpack("I7dI", data, position)
         end_of_name = data.index(b"\0", position + 64)
         try:
@@ -120,6 +123,7 @@ def _read_images(data: bytes, path: Path) -> Iterator[tuple[int, ImageRecord]]:
 def _read_points(data: bytes, path: Path) -> Iterator[tuple[int, PointRecord]]:
     position = 8
     for _ in range(_unpack("Q", data, 0)[0]):
+        # POINT3D_ID, X Y Z, R G B, ERROR, length of the track
         point_id, *numbers, length = _unpack("Q3d3BdQ", data, position)
         xyz, rgb, error = tuple(numbers[:3]), tuple(numbers[3:6]), numbers[6]
         track = _unpack(f"{2 * length}I", data, position + 51)
@@ -170,11 +174,13 @@ def _scan_images(data: Any, path: Path) -> int:
 
 def _scan_points(data: Any, path: Path) -> int:
     (count,) = _unpack("Q", data, 0)
+    # Before the loop, which a damaged count could keep busy for billions of rounds
     if 51 * count > len(data):
         raise struct.error("points missing")
     position = 8
     track_length = struct.Struct("<Q")
     for _ in range(count):
+        # The length of the track comes after 43 bytes of id, position, color and error.
         position += 51 + 8 * track_length.unpack_from(data, position + 43)[0]
     if position > len(data):
         raise struct.error("points missing")
@@ -190,6 +196,7 @@ def _scan_rigs(data: Any, path: Path) -> int:
         for sensor in range(sensors):
             _unpack("iI", data, position)
             position += 8
+            # The first sensor is the reference of its rig and has no pose; others may have one, of 7 doubles.
             if sensor > 0:
                 (has_pose,) = _unpack("B", data, position)
                 position += 1 + (56 if has_pose else 0)
@@ -202,6 +209,7 @@ def _scan_frames(data: Any, path: Path) -> int:
     (count,) = _unpack("Q", data, 0)
     position = 8
     for _ in range(count):
+        # After FRAME_ID, RIG_ID and a pose of 7 doubles
         (members,) = _unpack("I", data, position + 64)
         position += 68 + 16 * members
     if position > len(data):

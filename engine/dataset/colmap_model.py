@@ -112,6 +112,7 @@ def colmap_model_of(loaded: LoadedModel, folder: Path, *, origin_world: Origin |
     cameras = _convert_cameras(reconstruction, {image.camera_id for image in images}, folder, warnings)
     columns = _point_columns(reconstruction)
     points_world = columns["xyz"]
+    # Local coordinates are taken in 64 bits, before anything is rounded to 32.
     origin = _local_origin(images, points_world) if origin_world is None else origin_world
     images = tuple(_about_origin(image, origin) for image in images)
     points = _sparse_points(columns, points_world - np.array(origin), folder, warnings)

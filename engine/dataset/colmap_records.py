@@ -86,6 +86,7 @@ def build_reconstruction(records: ModelRecords) -> tuple[Any, int]:
         model.add_camera_with_trivial_rig(made)
     for image in records.images.values():
         w, x, y, z = image.quaternion_wxyz
+        # its quaternions end with w
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([x, y, z, w])), np.array(image.translation))
         model.add_image_with_trivial_frame(
             pycolmap.Image(
@@ -99,6 +100,7 @@ def build_reconstruction(records: ModelRecords) -> tuple[Any, int]:
     foreign = 0
     for point in records.points.values():
         track = pycolmap.Track()
+        # An observation that a track names twice counts once.
         for image_id, index in dict.fromkeys(point.track):
             holder = records.images.get(image_id)
             if (

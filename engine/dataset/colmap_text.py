@@ -90,6 +90,7 @@ def _read_lines(path: Path, repairs: list[str]) -> list[_Line]:
     except OSError as error:
         raise DatasetError(f"{path} cannot be read ({error.strerror}).") from error
     encoding, what = next((known for mark, known in _MARKS.items() if data.startswith(mark)), ("utf-8", ""))
+    # UTF-16 without a mark: every second byte of ASCII text is NUL.
     if not what and b"\0" in data[:4]:
         encoding, what = ("utf-16-le" if data[1:2] == b"\0" else "utf-16-be"), "is UTF-16"
     try:
@@ -99,7 +100,9 @@ def _read_lines(path: Path, repairs: list[str]) -> list[_Line]:
         raise DatasetError(f"{path} is neither UTF-8 nor UTF-16 (line {line}); save it as UTF-8.") from None
     if what:
         repairs.append(f"{path} {what}, and is read so.")
+    # Not splitlines(), which also breaks at characters that names may hold, such as U+2028
     numbered = enumerate(text.removesuffix("\n").split("\n"), start=1)
+    # Empty lines stay: after an image they say that it shows no points.
     return [(number, line.strip()) for number, line in numbered if not line.lstrip().startswith("#")]
 
 
@@ -188,7 +191,7 @@ def _read_points(path: Path, lines: Sequence[_Line], repairs: list[str]) -> dict
         form = "holds no point (POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK)"
         try:
             point_id, rgb = int(parts[0]), [int(float(part)) for part in parts[4:7]]
-            error = float(parts[7]) if len(parts) > 7 else -1.0
+            error = float(parts[7]) if len(parts) > 7 else -1.0  # -1: COLMAP's mark for an unknown error
             track = [int(part) for part in parts[8:]]
         except (ValueError, OverflowError):
             raise _line_error(path, number, form) from None

@@ -290,6 +290,7 @@ class Dataset:
     ) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]]:
         """Draw ``count`` pixels (view, y, x), uniformly and independently over all training views."""
         drawn = rng.integers(0, self._train_pixels[-1], size=count, dtype=np.int64)
+        # "right": a number that equals the end of one view is the first pixel of the next.
         which = np.searchsorted(self._train_pixels, drawn, side="right")
         view = self.train_indices[which]
         width = self._view_rays.sizes[view, 0]

@@ -141,6 +141,7 @@ def _rms_difference(one: Float32[np.ndarray, "h w 3"], two: Float32[np.ndarray, 
 
 def _merge_overlapping_groups(count: int, groups: Sequence[Group]) -> tuple[Group, ...]:
     """Return the groups with those that share a view made one, of two views or more."""
+    # Each group links its first view with all of its views; connected groups become one.
     rows = [group[0] for group in groups for _ in group]
     columns = [index for group in groups for index in group]
     links = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))

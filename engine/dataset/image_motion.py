@@ -28,6 +28,7 @@ def image_motion_by_pose(
     )
     x, y, z = points_cam.T
     zero = np.zeros_like(x)
+    # d(w x p) / dw = -[p]x: the points as a rotation w about the camera moves them
     by_turn = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)
     flow = np.concatenate([np.einsum("nij,njk->nik", by_point, by_turn), depth * by_point], axis=2)
     return np.where(np.isfinite(flow), flow, 0.0)

@@ -23,6 +23,7 @@ def match_image_names(names: Iterable[str], files: Collection[str]) -> Mapping[s
     """
     names = [name for name in names if PurePosixPath(_with_forward_slashes(name)).name]
     found = {name: normalize_name(name) for name in names if normalize_name(name) in files}
+    # From the strictest spelling to the loosest, so that no loose match takes the file of a strict one
     for spelling in (_with_forward_slashes, _fold_case, _without_suffix, _last_part, _folded_stem):
         taken = set(found.values())
         free = _by_spelling((file for file in files if file not in taken), spelling)

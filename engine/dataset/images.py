@@ -201,13 +201,14 @@ def _has_extra_samples(path: Path) -> bool:
     try:
         with path.open("rb") as file:
             head = file.read(8)
+            # The header of a BigTIFF (version 43) has 16 bytes, that of a TIFF 8.
             head += file.read(8) if head[2:4] in (b"\x2b\0", b"\0\x2b") else b""
             tags = ImageFileDirectory_v2(head)
             file.seek(tags.next)
             tags.load(file)
             return _EXTRA_SAMPLES in tags
     except (OSError, SyntaxError, ValueError, struct.error):
-        return True
+        return True  # where Pillow cannot tell, OpenImageIO's answer stands
 
 
 def _storage_kind(spec: Any, path: Path) -> Storage:
@@ -239,6 +240,7 @@ def _as_bits(values: Pixels, bits: int) -> Pixels:
     if values.dtype == target:
         return values
     if values.dtype == np.uint8:
+        # 255 * 257 = 65535: full brightness stays full brightness.
         return values.astype(np.uint16) * np.uint16(257)
     full = np.float32(np.iinfo(target).max)
     return (np.clip(_as_float(values), 0.0, 1.0) * full + np.float32(0.5)).astype(target)

@@ -145,6 +145,7 @@ def _find_images(
             f"{found[odd[0]]} is taken for {odd[0]}, for instance."
         )
     images = [replace(image, name=respelt.get(image.name, image.name)) for image in model.images]
+    # Names of files may sort otherwise than those of the model.
     images.sort(key=lambda image: image.name)
     paths = [on_disk[normalize_name(image.name)] for image in images]
     posed = set(found.values())
@@ -153,6 +154,7 @@ def _find_images(
         warnings.append(
             f"{len(unposed)} images in {folder} have no pose and are left out ({_name_list(unposed)})."
         )
+    # A file that the model has a pose for is a photograph, whatever its name ends with.
     beside = {owner: on_disk[mask] for mask, owner in owners.items() if mask not in posed}
     named = {
         respelt.get(name, name): path for name, path in _named_masks(folder, model.masks, warnings).items()
@@ -183,6 +185,7 @@ def _mask_paths(root: Path, located: _LocatedImages, warnings: list[str]) -> lis
     if not folder.is_dir() and not located.masks:
         return [None] * len(names)
     on_disk = files_below(folder)
+    # Exact names win over those that differ in case.
     on_disk = {name.casefold(): path for name, path in on_disk.items()} | on_disk
     masks = [mask_for(normalize_name(name), on_disk, located.masks) for name in names]
     without = [name for name, mask in zip(names, masks, strict=True) if mask is None]
@@ -197,10 +200,12 @@ def _mask_paths(root: Path, located: _LocatedImages, warnings: list[str]) -> lis
 
 
 def _check_size(camera: Camera, info: ImageInfo, image: PosedImage, path: Path) -> None:
+    # Photographs may be resized: their ratio of sides must be the camera's, up to the rounding of one side.
     expected_height = camera.height_px * info.width_px / camera.width_px
     expected_width = camera.width_px * info.height_px / camera.height_px
     if min(abs(expected_height - info.height_px), abs(expected_width - info.width_px)) <= 1:
         return
+    # EXIF orientations from 5 on swap width and height.
     turned = (
         " (its EXIF orientation asks to turn it, which COLMAP does not do)" if info.orientation >= 5 else ""
     )

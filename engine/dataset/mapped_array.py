@@ -24,7 +24,7 @@ class MappedArray:
         read, as read-ahead would load many unused neighbours.
         """
         size = path.stat().st_size
-        if size == 0:
+        if size == 0:  # an empty file cannot be mapped
             return cls.empty(dtype)
         with path.open("rb") as handle:
             mapped = mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ)

@@ -79,7 +79,7 @@ def posed_image_count(folder: Path) -> int:
             with (folder / "images.bin").open("rb") as file:
                 return int.from_bytes(file.read(8), "little")
         with (folder / "images.txt").open("rb") as file:
-            return sum(not line.startswith(b"#") for line in file) // 2
+            return sum(not line.startswith(b"#") for line in file) // 2  # two lines an image
     except OSError:
         return 0
 

@@ -101,6 +101,7 @@ def open_pixel_cache(
     known = None if digests is None else [(each.photograph, each.mask) for each in digests]
     index = _read_index(folder, int(offsets[-1]))
     if index is not None and index["stamp"] != stamp:
+        # JSON has lists where digests are pairs
         if [(*pair,) for pair in index["digests"]] == known and index["sizes_px"] == sizes_px:
             index["stamp"] = stamp
             write_json(folder / "pixels.json", index)
@@ -197,11 +198,13 @@ def _build_cache(
         planes["mask"] = pixels
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        # First of all: an index must never describe files that are being written.
         (folder / "pixels.json").unlink(missing_ok=True)
         with ExitStack() as stack:
             files: dict[str, int] = {}
             for name, size in planes.items():
                 temporary = stack.enter_context(atomic_replace(folder / f"{name}.bin"))
+                # Plain descriptors, as threads write with pwrite(), which needs no shared position
                 files[name] = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
                 stack.callback(os.close, files[name])
                 os.posix_fallocate(files[name], 0, size)  # a full disk shows now, not after an hour
@@ -231,6 +234,7 @@ def _build_cache(
         "mask": "mask" in planes,
         "warnings": warnings,
     }
+    # Last of all, as only the index makes the files valid
     write_json(folder / "pixels.json", index)
 
 
@@ -250,6 +254,7 @@ def _decode_all(
     progress: Progress | None,
 ) -> tuple[list[_ViewSummary], list[str]]:
     """Decode all views into ``files``; return what was found, and warnings."""
+    # Found below, before any call of decode()
     scales: dict[Storage, ValueScale] = {}
 
     def decode(index: int) -> _ViewSummary:
@@ -279,6 +284,7 @@ def _decode_all(
                 if progress is not None:
                     progress(len(summaries), len(futures))
         finally:
+            # After an error the other photographs need not be decoded.
             pool.shutdown(cancel_futures=True)
     return summaries, list(warnings)
 
@@ -317,6 +323,7 @@ def _decode_view(
 
 def _write_at_offset(file: int, values: np.ndarray, position: int) -> None:
     data = np.ascontiguousarray(values).data.cast("B")
+    # A write may take less than it was given.
     while data:
         written = os.pwrite(file, data, position)
         data, position = data[written:], position + written

@@ -60,6 +60,7 @@ def _check_shared_poses(folder: Path, names: Sequence[str], poses: Float64[np.nd
             f"All {len(names)} images of the model in {folder} have one and the same pose "
             f"({names[0]} to {names[-1]}), which shows nothing from two sides; run COLMAP again."
         )
+    # NumPy 2.0 gives the inverse a second axis.
     groups = groups.reshape(-1)
     shared = np.flatnonzero(counts[groups] > 1)
     if len(shared) == 0:

@@ -62,7 +62,7 @@ def open_ray_tables(cameras: Sequence[Camera], folder: Path, max_bytes: int = MA
         if camera.is_pinhole:
             continue
         size = camera.width_px * camera.height_px
-        if (pixels + size) * 12 > max_bytes:
+        if (pixels + size) * 12 > max_bytes:  # 3 float32 a pixel
             offsets[index] = NO_TABLE_COMPUTED
             continue
         offsets[index] = pixels
@@ -74,6 +74,7 @@ def open_ray_tables(cameras: Sequence[Camera], folder: Path, max_bytes: int = MA
     if not _is_up_to_date(table, index_file, _index_text(tabled), 12 * pixels):
         try:
             folder.mkdir(parents=True, exist_ok=True)
+            # First of all: an index must never describe a table of other cameras.
             index_file.unlink(missing_ok=True)
             with atomic_replace(table) as temporary, temporary.open("wb") as handle:
                 for camera in tabled:

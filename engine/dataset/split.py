@@ -50,6 +50,7 @@ def split_views(
                 f"({', '.join(unknown[:3])}); give names as they stand there."
             )
         is_chosen = np.array([normalize_name(name) in chosen for name in names], dtype=bool)
+        # Whoever shares a unit with a chosen view is held out with it.
         is_test = np.isin(unit, unit[is_chosen])
     else:
         is_test = unit % test_every == 0 if test_every else np.zeros(len(names), dtype=bool)
@@ -66,6 +67,7 @@ def _split_units(
     for group in duplicates:
         together = np.unique(unit[list(group)])
         unit[np.isin(unit, together)] = together[0]
+    # Numbered without gaps, as every N-th unit is held out
     return np.unique(unit, return_inverse=True)[1].astype(np.int64)
 
 

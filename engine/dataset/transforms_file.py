@@ -161,6 +161,7 @@ def photograph_name(file_path: str) -> str:
 
 def _read_file(path: Path) -> _File:
     try:
+        # With or without a byte order mark
         file = _File.model_validate(json.loads(path.read_bytes().decode("utf-8-sig")))
     except OSError as error:
         raise DatasetError(f"{path} cannot be read ({error.strerror}).") from error
@@ -214,6 +215,7 @@ def _camera_of_frame(
     if name in _PINHOLES or not any((k1, k2, k3, p1, p2)):
         return "PINHOLE", width, height, (fx, fy, cx, cy)
     if k3:
+        # Only the rational model has k3; its denominator stays 1.
         return "FULL_OPENCV", width, height, (fx, fy, cx, cy, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
     return "OPENCV", width, height, (fx, fy, cx, cy, k1, k2, p1, p2)
 
@@ -242,6 +244,7 @@ def _posed_image(path: Path, frame: _Frame, number: int, name: str, camera_id: i
             f"{path} gives {frame.file_path} a transform_matrix that is no rigid motion (it scales, shears "
             "or mirrors); write the poses anew."
         )
+    # The axes of the camera: from y up and -z ahead to y down and z ahead
     rotation[:, 1:] *= -1
     cam_from_world = rotation.T
     x, y, z, w = pycolmap.Rotation3d(np.ascontiguousarray(cam_from_world)).quat.tolist()

@@ -68,7 +68,7 @@ def write_frames(video: Path, folder: Path, frames_per_second: float, on_step: O
     partial = folder.with_name(f".{folder.name}.partial")
     try:
         (partial / "images").mkdir(parents=True, exist_ok=True)
-        for old in (partial / "images").iterdir():
+        for old in (partial / "images").iterdir():  # of a run that was interrupted
             old.unlink()
         count = _write_sharpest(video, partial / "images", frames_per_second, on_step)
         write_json(partial / RECORD_FILE, record)
@@ -84,6 +84,7 @@ def planned_frames(video: Path, frames_per_second: float) -> ImageSizes:
     Raises:
         DatasetError: the video cannot be read.
     """
+    # Rounding must not add a stretch to a duration of whole ones.
     count = max(1, math.ceil(_duration_seconds(video) * frames_per_second - 1e-6))
     with _open_frames(video, frames_per_second, most=1) as frames:
         shapes = [frame.shape for frame in frames]
@@ -109,6 +110,7 @@ def _open_frames(
         "-f", "image2pipe", "-c:v", "ppm", "-",
     ]  # fmt: skip
     with (
+        # Messages go into a file: a full pipe of them would block ffmpeg while its frames are read.
         tempfile.TemporaryFile() as said,
         subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=said) as process,  # noqa: S603
     ):
@@ -119,7 +121,7 @@ def _open_frames(
                 said.seek(0)
                 raise _unreadable(video, said.read().decode(errors="replace"))
         finally:
-            process.kill()
+            process.kill()  # the reader may have stopped early, while ffmpeg waits to write
 
 
 def _read_ppm_images(stream: IO[bytes]) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
@@ -175,6 +177,7 @@ def _write_sharpest(video: Path, images: Path, frames_per_second: float, on_step
     best: UInt8[np.ndarray, "height width 3"] | None = None
     with _open_frames(video, looked_at) as frames:
         for number, image in enumerate(frames):
+            # A quotient may be rounded to just below a whole number.
             at = int(number / looked_at * frames_per_second + 1e-9)
             if at != stretch and best is not None:
                 _write_jpeg(best, images / f"{count:05d}.jpg")

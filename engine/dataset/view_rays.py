@@ -37,6 +37,7 @@ class ViewRays:
         origins = np.stack([view.origin_world for view in model.views])
         self.origins_world: Float32[np.ndarray, "v 3"] = origins.astype(np.float32)
         self._pinhole_params: Float64[np.ndarray, "c 4"] = np.array(
+            # The numbers of a camera that is no pinhole are never used.
             [camera.pinhole_params if camera.is_pinhole else (1.0, 1.0, 0.0, 0.0) for camera in model.cameras]
         )
         self._has_no_table = tables.offsets == NO_TABLE_COMPUTED
@@ -98,6 +99,7 @@ class ViewRays:
         """Return the pixels of each selected camera, by its number."""
         camera = self._view_camera[view]
         chosen = np.flatnonzero(selected[camera])
+        # One camera after another, as a lens model takes the points of one
         chosen = chosen[np.argsort(camera[chosen], kind="stable")]
         if len(chosen) == 0:
             return []

@@ -104,6 +104,7 @@ class ViewsRecord(_FrozenModel):
     @model_serializer(mode="wrap")
     def _without_zero_origin(self, write: Callable[["ViewsRecord"], dict[str, object]]) -> dict[str, object]:
         content = write(self)
+        # Left out where it is zero, so that fingerprints are those of records that know no origin
         if not is_set(self.origin_world):
             del content["origin_world"]
         return content
@@ -149,6 +150,7 @@ class ViewsRecord(_FrozenModel):
         """Return the views with poses relative to another local origin."""
         if origin_world == self.origin_world:
             return self
+        # x_new = x_old + old origin - new origin
         shift = np.array(self.origin_world) - np.array(origin_world)
         moved = self.transformed(1.0, np.eye(3), shift)
         return moved.model_copy(update={"origin_world": origin_world})
@@ -159,6 +161,7 @@ class ViewsRecord(_FrozenModel):
         """Return the views in a world that was rotated, scaled and then shifted; the images stay the same."""
         views = []
         for row in self.views:
+            # x' = scale turn x + shift, so that R' = R turn^T and t' = scale t - R' shift
             rotation = np.array(row.rotation_cam_from_world) @ turn.T
             translation = scale * np.array(row.translation_cam_from_world) - rotation @ shift_world
             pose = {

@@ -68,10 +68,11 @@ def infer_q(mesh: ImportedMesh, opacities: Float[np.ndarray, " n"], default: flo
     )
     estimates = np.zeros(0)
     if mesh.radius is not None:
-        estimates = mesh.radius[vertices].astype(np.float64) ** 2 - 2 * logs
+        estimates = mesh.radius[vertices].astype(np.float64) ** 2 - 2 * logs  # Q = radius^2 - 2 ln a
     elif mesh.uv is not None:
         squares = 4 * np.sum((mesh.uv[vertices].astype(np.float64) - 0.5) ** 2, axis=-1)
         with np.errstate(divide="ignore", invalid="ignore"):
+            # squares = radius^2 / Q = 1 + 2 ln a / Q; near 1, for opacities near 1, it says nothing of Q.
             estimates = np.where(squares < 0.9, 2 * logs / (squares - 1), np.nan)
     estimates = estimates[np.isfinite(estimates) & (estimates > 0)]
     return _snap_q(float(np.median(estimates))) if len(estimates) else default

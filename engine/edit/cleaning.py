@@ -44,6 +44,7 @@ def clean(
     if options.floaters and keep.any():
         rows = np.flatnonzero(keep)
         labels, sizes = linked_groups(gaussians.select(rows), options.link, options.neighbors)
+        # The largest group stays, however small it is.
         loose = sizes[labels] < min(options.min_group, sizes.max())
         keep[rows[loose]] = False
         floating = int(loose.sum())
@@ -71,7 +72,7 @@ def linked_groups(gaussians: FlatGaussians, link: float, neighbours: int) -> tup
     if count < 2:
         return np.zeros(len(gaussians), np.int64), np.full(min(1, len(gaussians)), len(gaussians))
     distances, near = KDTree(gaussians.means_world).query(gaussians.means_world, k=count)
-    distances, near = distances[:, 1:], near[:, 1:]
+    distances, near = distances[:, 1:], near[:, 1:]  # without the nearest, the Gaussian itself
     extents = gaussians.scales.max(axis=1).astype(np.float64)
     extents = np.minimum(extents, MAX_LINK * np.median(distances, axis=1))
     linked = distances <= link * (extents[:, None] + extents[near])

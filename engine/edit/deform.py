@@ -28,6 +28,7 @@ def deformation_corners(gaussians: FlatGaussians) -> Float64[np.ndarray, "n 8 3"
     An octagon of radius sqrt(2) standard deviations, whatever the opacity; its mean is the centre.
     """
     corners = np.empty((len(gaussians), SIDES, 3))
+    # Harmonics take most of the memory and are not needed here.
     geometry = gaussians.with_base_color_only()
     for block in row_blocks(len(gaussians)):
         part = geometry.select(block)
@@ -86,6 +87,7 @@ def deform_to(
             raise ValueError("the deformation gave points that are not finite")
         present, radii = np.ones(moves.shape[:2], dtype=bool), np.full(len(moves), CUBATURE_RADIUS)
         fit = fit_octagons(geometry.select(block), moves, present, radii)
+        # What rounding alone may leave of an octagon that collapsed
         rounding = 8 * np.finfo(np.float64).eps * np.abs(moved).max(axis=(1, 2))
         unmoved[block] = ~moves.any(axis=(1, 2))
         collapsed[block] = ~unmoved[block] & ~has_area(fit.legs_world, rounding)

@@ -43,7 +43,7 @@ def expression_variables(
     """
     means = gaussians.means_world
     if is_set(origin_world):
-        means = means + np.array(origin_world)
+        means = means + np.array(origin_world)  # in 64 bits
     numbers = {axis: means[:, k] for k, axis in enumerate("xyz")}
     numbers["opacity"] = gaussians.opacities
     for name, array in gaussians.channels.items():
@@ -64,6 +64,7 @@ def parse_filter(text: str) -> ast.expr:
     try:
         tree = ast.parse(text.strip(), mode="eval").body
         _check_node(text, tree)
+    # The parser raises ValueError for NUL characters, and the last two for deep nesting.
     except (SyntaxError, ValueError, RecursionError, MemoryError):
         raise ConfigError(f"'{text}' is no expression; {_ADVICE}.") from None
     return tree
@@ -88,6 +89,7 @@ def filter_mask(
         for part in (node.left, *node.comparators) if isinstance(node, ast.Compare) else ():
             if (name := _variable_name(part)) is not None and name not in numbers:
                 raise ConfigError(f"'{text}': the scene has no {name}; it has {', '.join(numbers)}.")
+    # An expression of constants alone gives a single value.
     result = np.broadcast_to(_evaluate_condition(tree, numbers), len(gaussians))
     return np.array(result, dtype=bool)
 

@@ -73,6 +73,7 @@ def _blend_weights(tracer: Tracer, rays: RayBatch, count: int) -> Float64[np.nda
     if len(rays):
         traced = tracer.trace(rays, record=True)
         assert traced.recording is not None
+        # Without gradients: only the sums of the blending weights are wanted.
         found = tracer.backward(traced.recording, TraceGradients(np.zeros_like(traced.rgb_srgb))).numpy()
         sums[found.ids] = found.weight_sums
     return sums

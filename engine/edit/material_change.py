@@ -53,7 +53,7 @@ def refit_sh(
         frame: its right, up and forward in the world, as rows.
     """
     directions_world = fibonacci_sphere(_DIRECTIONS)
-    solve = np.linalg.pinv(sh_basis(directions_world, after.sh_degree))
+    solve = np.linalg.pinv(sh_basis(directions_world, after.sh_degree))  # least squares over the directions
     sh, rows = after.sh.copy(), np.flatnonzero(chosen)
     for start in range(0, len(rows), _ROWS_PER_BLOCK):
         part = rows[start : start + _ROWS_PER_BLOCK]
@@ -74,6 +74,7 @@ def _shaded_colors(
     count, views = len(gaussians), len(directions_world)
     directions = np.tile(directions_world, (count, 1))
     normals = np.repeat(gaussians.rotations[:, :, 0].astype(np.float64), views, axis=0)
+    # Normals face the viewer, whom directions lead away from.
     normals *= np.where((normals * directions).sum(axis=1) > 0, -1.0, 1.0)[:, None]
     material = np.repeat(stack_channels(gaussians.channels, list(MATERIAL_WIDTHS)), views, axis=0)
     surface = SurfacePoints.unoccluded(material, normals, directions)

@@ -86,6 +86,7 @@ def recover_gaussians(
         report.axes = options.axes
     if report.axes != "x0":
         octagons = replace(octagons, corners_world=octagons.corners_world @ AXIS_ROTATIONS[report.axes].T)
+    # Of several octagons of a Gaussian, that nearest to where it was exported is the original.
     if octagons.is_copy.any():
         octagons = octagons.prefer_nearest(_mean_displacements(geometry, octagons, radii))
     old = geometry.select(octagons.gids)
@@ -148,6 +149,7 @@ def _recover_parameters(
         report.partial += int(torn.sum())
         if options.whole_octagons and torn.any():
             report.snapped += int(torn.sum())
+            # A torn octagon follows the greater part of its corners.
             follows = torn & (2 * (is_moved & present).sum(axis=1) >= present.sum(axis=1))
             present = np.where(follows[:, None], present & is_moved, present)
             moves[(torn & ~follows)] = 0.0
@@ -271,6 +273,7 @@ def _assemble(
     gids = octagons.gids
     absent = np.ones(len(gaussians), dtype=bool)
     absent[gids] = False
+    # What has no octagon in the mesh either never had one, or was deleted in the editor.
     never, deleted = absent & ~exported, absent & exported
     report.deleted = int(deleted.sum())
     is_retained = np.ones(len(octagons), dtype=bool)
@@ -295,6 +298,7 @@ def _assemble(
         deleted_means=gaussians.means_world[deleted].astype(np.float64),
     )
     own = np.flatnonzero(recovered.readable & is_retained)
+    # An octagon that is in the mesh was not deleted, even where its nearest neighbor was.
     orphaned = moved.orphaned.copy()
     orphaned[: len(unreadable)] = False
     report.orphaned = int(orphaned.sum())

@@ -51,5 +51,6 @@ def was_mirrored(
 
 def signed_volume(vertices_world: Float64[np.ndarray, "v 3"], triangles: Int64[np.ndarray, "t 3"]) -> float:
     """Return the volume inside a closed mesh, cubic world units; negative if its triangles face inwards."""
+    # About the mean: far from the origin, large terms would cancel.
     a, b, c = (vertices_world - vertices_world.mean(axis=0))[triangles].transpose(1, 0, 2)
     return float(np.einsum("ti,ti->", a, np.cross(b, c)) / 6.0)

@@ -108,6 +108,7 @@ def _spread_samples(
     for cut in np.unique(cuts):
         rows = np.flatnonzero(cuts == cut)
         i, j = np.meshgrid(np.arange(cut), np.arange(cut), indexing="ij")
+        # Centroids of the sub-triangles that are not turned over
         u, v = ((i + 1 / 3) / cut).ravel(), ((j + 1 / 3) / cut).ravel()
         inner = u + v <= 1
         barycentric = np.stack([1 - u - v, u, v], axis=-1)[inner]

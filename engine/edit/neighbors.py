@@ -71,6 +71,7 @@ def _orthogonal_fits(
     u, spread, vt = np.linalg.svd(np.einsum("nki,nkj->nij", new, old))
     best = np.sign(np.linalg.det(u @ vt))
     total = np.sqrt(np.sum(old**2, axis=(1, 2)) * np.sum(new**2, axis=(1, 2)))
+    # Correlations of best rotation and best reflection differ by twice the least singular value.
     sign = np.where(2 * spread[:, 2] > MIRROR_GAIN * total, best, planar_sign)
     u[:, :, 2] *= (sign * best)[:, None]
     agreement = spread[:, 0] + spread[:, 1] + sign * best * spread[:, 2]
@@ -83,6 +84,7 @@ def _find_rim_gaussians(
     old: Float64[np.ndarray, "m k 3"], new: Float64[np.ndarray, "m k 3"], turns: Float64[np.ndarray, "m 3 3"]
 ) -> Bool[np.ndarray, " m"]:
     """Return Gaussians whose nearest neighbours moved differently: the rim of what was moved."""
+    # The first neighbor of a Gaussian is itself.
     around_old, around_new = old[:, 1:].mean(axis=1), new[:, 1:].mean(axis=1)
     reach_old = np.sqrt(np.mean(np.sum((old[:, 1:] - around_old[:, None]) ** 2, axis=2), axis=1))
     reach_new = np.sqrt(np.mean(np.sum((new[:, 1:] - around_new[:, None]) ** 2, axis=2), axis=1))
@@ -164,6 +166,7 @@ def interpolate_motion(
 def _neighbor_weights(distances: Float[np.ndarray, "u k"]) -> Float[np.ndarray, "u k"]:
     """Return weights that fall to zero at the last neighbour, so that they are continuous."""
     reach = distances[:, -1:] * (1 + 1e-6) + 1e-30
+    # The small term keeps the sum above 0 where all neighbors are equally far.
     weights = (1 - distances / reach) ** 2 + 1e-12
     result: np.ndarray = weights / weights.sum(axis=1, keepdims=True)
     return result

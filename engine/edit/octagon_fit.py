@@ -52,6 +52,7 @@ def fit_octagons(
     old_legs = legs_world(gaussians)
     design = np.concatenate([np.ones((SIDES, 1)), corner_directions()], axis=1)
     fitted = np.zeros((len(moves), 3, 3))  # rows: shift of the centre, moves of the two legs times radius
+    # The corners that are there as the bits of a byte: octagons with the same ones share a solution.
     codes = np.packbits(present, axis=1, bitorder="little")[:, 0]
     for code in np.unique(codes):
         corners = np.flatnonzero((int(code) >> np.arange(SIDES)) & 1)
@@ -73,6 +74,7 @@ def fit_octagons(
 
 def largest_scale(legs: Float64[np.ndarray, "n 3 2"]) -> Float64[np.ndarray, " n"]:
     """Return the larger singular value of each 3 x 2 matrix, whose columns are tangent vectors."""
+    # Eigenvalues of the 2 x 2 Gram matrix are mean + spread and mean - spread.
     gram = legs.transpose(0, 2, 1) @ legs
     mean = (gram[:, 0, 0] + gram[:, 1, 1]) / 2
     spread = np.hypot((gram[:, 0, 0] - gram[:, 1, 1]) / 2, gram[:, 0, 1])

@@ -180,12 +180,14 @@ def _octagon_of_vertex(
     if not doubled.any():
         return instance
     corners = node_of_vertex[triangles]
+    # Two edges are enough to connect the corners of a triangle.
     edges = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]]])
     edges = edges[(edges >= 0).all(axis=1)]
     edges = edges[(gids[edges[:, 0]] == gids[edges[:, 1]]) & doubled[edges[:, 0]]]
     ones = np.ones(len(edges), dtype=np.int8)
     graph = coo_array((ones, (edges[:, 0], edges[:, 1])), shape=(len(keys), len(keys)))
     _, parts = connected_components(graph, directed=False)
+    # Numbers that no Gaussian has
     instance[doubled] = len(keys) + gids.max() + 1 + parts[doubled]
     return instance
 
@@ -208,7 +210,7 @@ def _assemble(
     first_vertex = np.full(count, len(keys))
     np.minimum.at(first_vertex, numbers, np.arange(len(keys)))
     places = numbers * SIDES + keys % SIDES
-    del numbers
+    del numbers  # frees a number a vertex
     claims = np.bincount(places, minlength=count * SIDES).reshape(count, SIDES)
     present, ambiguous = claims == 1, int((claims > 1).sum())
     del claims
@@ -260,6 +262,7 @@ def _is_uv_in_order(mesh: ImportedMesh, radii: np.ndarray, all_radii: np.ndarray
         return True
     found_uv = mesh.uv.reshape(-1, SIDES, 2)
     # The common factor, the exporter's 1 / sqrt(Q), is fitted: it may not be known here.
+    # Formats differ in whether v runs up or down.
     for flip in (1.0, -1.0):
         products = [
             (np.sum(expected * expected), np.sum(expected * here))

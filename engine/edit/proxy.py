@@ -65,6 +65,7 @@ class Proxy:
     def is_closed(self) -> bool:
         """Return whether every edge has two triangles, which run along it in opposite directions."""
         edges = self.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+        # An edge as one number, and its reverse as another
         codes = edges[:, 0] * len(self.vertices_world) + edges[:, 1]
         back = edges[:, 1] * len(self.vertices_world) + edges[:, 0]
         return len(np.unique(codes)) == len(codes) and np.array_equal(np.sort(codes), np.sort(back))
@@ -155,6 +156,7 @@ class NearestBinding:
         moved = _check_vertices(vertices_world, self._proxy)[self._proxy.triangles]
         rest = self._proxy.vertices_world[self._proxy.triangles]
         side = -1.0 if self._proxy.is_mirrored(vertices_world) else 1.0
+        # F = moved frame . (rest frame)^-1 takes edges to edges, and the normal to the normal.
         derivatives = _moved_frames(moved, rest, side) @ np.linalg.inv(self._frames)
         moved_centres = moved.mean(axis=1)
         result = np.empty_like(self._corners)
@@ -235,6 +237,7 @@ class MeanValueBinding:
             rows = self._rows[block]
             weights = self._corner_coordinates(rows) if self._stored is None else self._stored[number]
             corners = self._corners[rows]
+            # Moved by the shifts of the vertices, so that a cage at rest leaves every corner exactly
             moved = corners + (weights @ shifts).reshape(corners.shape)
             result[rows] = _blend_corners(corners, moved, self._influence[rows])
         return result

@@ -89,6 +89,7 @@ def _write_light(source: Path, target: Path, turn: Float64[np.ndarray, "3 3"]) -
         content["reconstruction"]["train"]["materials"]["up_world"] = new_up.tolist()
     write_json(target / CONFIG, content)
     messages = []
+    # The background map has one frame, whatever is up in the scene.
     below = environment_frame(np.array(UP_WORLD))
     for name, old_frame, new_frame in (
         (ENVIRONMENT_EXR, environment_frame(up), environment_frame(new_up)),
@@ -127,6 +128,7 @@ def rotate_environment(
     from octasplat.engine.shading.kernels.environment_map import map_colors
 
     height = len(values)
+    # From texels to the new world, and by the inverse rotation to the old one
     directions = _texel_directions(height) @ new_frame @ turn
     turned = np.empty((2 * height * height, 3), np.float32)
     texels = np.ascontiguousarray(values).reshape(-1, 3)
@@ -151,6 +153,7 @@ def _rotation_of(matrix: Float[np.ndarray, "4 4"]) -> Float64[np.ndarray, "3 3"]
     u, _, vt = np.linalg.svd(np.asarray(matrix, np.float64)[:3, :3])
     turn: Float64[np.ndarray, "3 3"] = u @ vt
     near = np.round(turn)
+    # Whole numbers are made exact: an identity is told by equality.
     return near if np.allclose(turn, near, rtol=0, atol=1e-12) else turn
 
 

@@ -184,6 +184,7 @@ def format_axis_number(value: float) -> str:
 
 def _subsample(values: list[tuple[float, float]]) -> list[tuple[float, float]]:
     step = max(1, math.ceil(len(values) / MAX_POINTS))
+    # The last value always stays, as the end of the curve.
     return values[::step] + ([values[-1]] if values and (len(values) - 1) % step else [])
 
 
@@ -194,6 +195,7 @@ def _layout_chart(
     series: list[tuple[_SeriesSource, list[tuple[float, float]]]],
 ) -> Chart:
     """Return a chart's axes, ticks and lines in SVG units; ``series`` has at least one point."""
+    # One value without a logarithm makes the whole axis linear.
     logarithmic = chart.logarithmic and all(y > 0 for _, values in series for _, y in values)
     if logarithmic:
         series = [(source, [(x, math.log10(y)) for x, y in values]) for source, values in series]
@@ -251,6 +253,7 @@ def _linear_ticks(low: float, high: float, about: int) -> list[float]:
     """Return round numbers within a range, ``about`` of them."""
     raw = (high - low) / about
     power = 10.0 ** math.floor(math.log10(raw))
+    # Rounding must not pass over a step that fits exactly.
     step = next(power * f for f in (1, 2, 2.5, 5, 10) if power * f >= raw * 0.999)
     first = math.ceil(low / step - 1e-9)
     return [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]

@@ -96,6 +96,7 @@ def magma(values: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w 3"]:
 
 def webp_data_uri(image: Float32[np.ndarray, "h w 3"]) -> str:
     """Return the image as a WebP data URI, for a page without other files."""
+    # write_webp() writes to files only.
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "image.webp"
         write_webp(path, image, quality=WEBP_QUALITY)

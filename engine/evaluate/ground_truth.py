@@ -20,6 +20,7 @@ from octasplat.engine.core.relative_paths import check_relative_path
 from octasplat.engine.render.image_files import read_image, shrink_to
 
 GROUND_TRUTH_FILE = "truth.json"
+# v, then optionally /a, *b and +c or -c, in this order
 _FORMULA = re.compile(r"\bv(?:/(\d+(?:\.\d+)?))?(?:\*(\d+(?:\.\d+)?))?([+-]\d+(?:\.\d+)?)?(?![\w*/+])")
 _AXES = {f"{sign}{name}": k for k, name in enumerate("xyz") for sign in ("+", "-", "")}
 
@@ -157,6 +158,7 @@ class GroundTruth:
         image = read_image(folder / name)
         if image.shape[2] != 4:
             raise DatasetError(f"{folder / name} has no alpha, which tells the scene from what is behind it.")
+        # Premultiplied before it is shrunk, so that colors of transparent pixels do not mix in
         image[..., :3] *= image[..., 3:]
         return shrink_to(image, max_side_px)
 
@@ -205,12 +207,14 @@ class GroundTruth:
         path = self.path.parent / self.content.test.folder / kind / name
         image = read_image(path)
         height, width = image.shape[:2]
+        # The same proportions, up to the rounding of one side
         if abs(height * size[1] - width * size[0]) > max(height, width) or height < size[0]:
             raise DatasetError(
                 f"{path} has {width} x {height} pixels, which does not suit the view's {size[1]} x {size[0]}."
             )
         rows = ((np.arange(size[0]) + 0.5) * height / size[0]).astype(int)
         columns = ((np.arange(size[1]) + 0.5) * width / size[1]).astype(int)
+        # read_image() gives values from 0 to 1, formulas are of the stored integers.
         return image[rows[:, None], columns].astype(np.float64) * _integer_steps(path)
 
 
@@ -225,6 +229,7 @@ def find_ground_truth(folder: Path) -> GroundTruth | None:
         return read_ground_truth(inside)
     if beside.is_file():
         truth = read_ground_truth(beside)
+        # One beside a folder counts only if the folder is that of its own views.
         if beside.parent / truth.content.test.folder == folder.resolve():
             return truth
     return None
@@ -241,6 +246,7 @@ def read_ground_truth(path: Path) -> GroundTruth:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"]) or "content"
+        # The prefix is pydantic's.
         raise ConfigError(f"{path}: {where}: {first['msg'].removeprefix('Value error, ')}.") from None
     except OSError as error:
         raise ConfigError(f"{path} cannot be read ({error.strerror}).") from None

@@ -45,6 +45,7 @@ def normal_angles_degrees(
 ) -> Float64[np.ndarray, "*n"]:
     """Return angles between unit vectors; 90 where the first is 0."""
     cosine = (normal_world.astype(np.float64) * true_world).sum(axis=-1)
+    # The arctangent of both is exact where angles are small; an arccosine is not.
     sine = np.linalg.norm(np.cross(normal_world.astype(np.float64), true_world), axis=-1)
     angle = np.degrees(np.arctan2(sine, cosine))
     return np.where((normal_world == 0).all(axis=-1), 90.0, angle)
@@ -101,6 +102,7 @@ def fit_channel_scales(
         if not (x > 0).any():
             continue
 
+        # Defaults hold the values of this channel; names alone would be looked up when called.
         def error(octaves: float, x: np.ndarray = x, target: np.ndarray = target) -> float:
             return float((weight * np.square(curve(2.0**octaves * x) - target)).sum())
 
@@ -122,16 +124,18 @@ def environment_errors(
     Ours is looked up at the pixels of the true map, bilinearly.
     """
     height, width = true.radiance_linear.shape[:2]
+    # Angles from the map's up axis, and around it from its forward axis
     polar = (np.arange(height) + 0.5) / height * np.pi
     around = ((np.arange(width) + 0.5) / width - 0.5) * 2 * np.pi
     sine, cosine = np.sin(polar)[:, None], np.cos(polar)[:, None]
     local = np.stack(
         [sine * np.sin(around), np.broadcast_to(cosine, (height, width)), sine * np.cos(around)], axis=-1
     )
-    directions = (local @ true.frame).reshape(-1, 3)
+    directions = (local @ true.frame).reshape(-1, 3)  # frame: right, up, forward as rows
     lights = build_light_arrays((), ours.frame[1], ours)
     found, _ = eval_environment_map(lights, directions)
     true_radiance = true.radiance_linear.reshape(-1, 3).astype(np.float64)
+    # The solid angle of a pixel shrinks with the sine towards the poles.
     weights = np.repeat(np.sin(polar), width)
     scales = fit_channel_scales(found, true_radiance, compress_radiance, weights)
     return (

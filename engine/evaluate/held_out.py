@@ -100,6 +100,7 @@ def evaluate_held_out(
             ViewImages(view.reference, view.render, measured.flip_map, view.layers),
         )
         progress(PhaseProgress("evaluate", len(rows), len(dataset.test_indices)))
+    # One warning of another world is enough.
     if check is not None and not warnings:
         warnings = _as_warnings(check.warn_of_renders(), progress)
     if measures is not None and environment is not None:
@@ -179,6 +180,7 @@ def _measure_views(
     with ThreadPoolExecutor(workers) as pool:
         for view in views:
             waiting.append((view, pool.submit(measure_view, view)))
+            # No more may wait, as each view holds several pictures.
             if len(waiting) > workers:
                 first, future = waiting.pop(0)
                 yield first, future.result()

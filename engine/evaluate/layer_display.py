@@ -50,6 +50,7 @@ def _depth_to_gray(image: RenderedImage) -> Float32[np.ndarray, "h w"]:
     visible_depths = image.depth[image.alpha >= MIN_ALPHA]
     if len(visible_depths) == 0:
         return np.zeros_like(image.depth)
+    # Quantiles, as a few stray pixels must not take up the whole range
     near, far = np.quantile(visible_depths, (0.01, 0.99))
     place = np.clip((image.depth - near) / max(far - near, 1e-9), 0, 1)
     return np.asarray(1 - (1 - FAR_GRAY) * place, np.float32)

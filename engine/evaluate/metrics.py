@@ -20,11 +20,13 @@ from scipy.ndimage import correlate1d
 
 from octasplat.engine.core.color import to_bytes
 
+# Window and constants of the SSIM paper; the weights are those of the MS-SSIM paper.
 SSIM_WINDOW = 11
 SSIM_SIGMA = 1.5
 SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
 MS_SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
+# FLIP's default viewer: 0.7 m from a screen that is 0.7 m wide and has 3840 pixels
 PIXELS_PER_DEGREE = 67.0
 
 DEFINITIONS: dict[str, str] = {
@@ -149,6 +151,7 @@ def ms_ssim(
     for scale, exponent in enumerate(MS_SSIM_WEIGHTS):
         luminance, structure = _ssim_terms(x, y)
         last = scale == len(MS_SSIM_WEIGHTS) - 1
+        # Luminance counts at the coarsest scale only, as in the paper.
         values = _crop_window_margin(luminance * structure if last else structure)
         mean = (
             values.mean(axis=(0, 1))

@@ -51,6 +51,7 @@ def measure_multiscale(
         for scale in scales:
             if min(weight.shape) < scale:
                 continue
+            # Only blocks of nothing but valid pixels count.
             counts = (block_means(weight[..., None], scale)[..., 0] == 1).astype(np.float32)
             small = quantize_8_bit(block_means(photograph, scale))
             for across in rays_across:

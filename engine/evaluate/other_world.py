@@ -87,6 +87,7 @@ def far_views(run: Viewpoints, others: Viewpoints, extent_world: float) -> Bool[
 
 def blind_views(views: Viewpoints, gaussians: FlatGaussians) -> Bool[np.ndarray, " v"]:
     """Return which views have next to no Gaussian in their picture."""
+    # Each once where there are fewer Gaussians than samples
     rows: Int64[np.ndarray, " s"] = np.unique(np.linspace(0, len(gaussians) - 1, SAMPLES).astype(np.int64))
     points = gaussians.means_world[rows]
     seen = [

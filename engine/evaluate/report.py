@@ -101,7 +101,7 @@ def write_report(
     environment = Environment(
         loader=PackageLoader("octasplat.engine.evaluate", package_path=""),
         autoescape=select_autoescape(["html"]),
-        undefined=StrictUndefined,
+        undefined=StrictUndefined,  # a misspelled name is an error
         trim_blocks=True,
         lstrip_blocks=True,
     )
@@ -176,6 +176,7 @@ def _metric_columns(mean: Mapping[str, object]) -> list[Column]:
     """Return the measured metrics; color-corrected PSNR only where the correction makes a difference."""
     columns = [column for column in COLUMNS if column.key in mean]
     plain, corrected = (_as_number(mean.get(key), math.nan) for key in ("psnr", "psnr_colour_corrected"))
+    # Not-a-number, where one of them is missing, fails the comparison.
     if corrected - plain >= MIN_EXPOSURE_GAIN_DB:
         return columns
     return [column for column in columns if column.key != "psnr_colour_corrected"]
@@ -343,6 +344,7 @@ def _as_mapping(value: object) -> Mapping[str, object]:
 
 
 def _as_number(value: object, otherwise: float) -> float:
+    # In Python the JSON values true and false are numbers.
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else otherwise
 
 
@@ -351,4 +353,4 @@ def _format_value(value: object, decimals: int) -> str:
 
 
 def _format_thousands(value: int) -> str:
-    return f"{value:,}".replace(",", "\u202f")
+    return f"{value:,}".replace(",", "\u202f")  # narrow no-break space

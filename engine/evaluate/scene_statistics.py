@@ -90,6 +90,7 @@ def scene_statistics(gaussians: FlatGaussians, up_world: Float64[np.ndarray, "3"
 
 def hit_statistics(tracer: Tracer, image: ImageRays) -> HitStatistics:
     """Return how many Gaussians the rays of an image hit; ``tracer`` has the scene built."""
+    # In tiles, as tracers follow neighboring rays together
     hits = tracer.trace(image.rays[tile_order(image.height_px, image.width_px)]).hit_counts
     some = hits[hits > 0]
     if len(some) == 0:

@@ -65,8 +65,9 @@ def sample_surface(
     """Sample points uniformly over the area of a mesh; returns them and their triangles."""
     sums = np.cumsum(mesh.face_areas)
     face = np.searchsorted(sums, rng.random(count) * sums[-1], side="right").astype(np.int64)
-    face = np.minimum(face, len(sums) - 1)
+    face = np.minimum(face, len(sums) - 1)  # a sum of rounded areas may end below the number drawn
     a, b, c = mesh.face_corners_world[face].transpose(1, 0, 2)
+    # The root makes points uniform over the area of the triangle.
     s, t = np.sqrt(rng.random((count, 1))), rng.random((count, 1))
     return (1 - s) * a + s * (1 - t) * b + s * t * c, face
 
@@ -83,7 +84,7 @@ def distances_to_surface(
     nearest to the point is not among those of its eight nearest samples.
     """
     points, faces = sample_surface(mesh, samples, rng)
-    # Large triangles could be missed by chance only if they are small, but every corner helps those.
+    # A small triangle may get no sample by chance; its corners stand for it then.
     corners = mesh.face_corners_world
     tree = cKDTree(np.concatenate([points, corners.reshape(-1, 3)]))
     owners = np.concatenate([faces, np.repeat(np.arange(len(mesh.faces)), 3)])

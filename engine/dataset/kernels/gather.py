@@ -97,6 +97,7 @@ def gather_rays(
             dy = (y[i] + 0.5 - camera_pinhole[camera, 3]) / camera_pinhole[camera, 1]
         elif camera_table[camera] >= 0:
             first = 3 * (camera_table[camera] + y[i] * view_size[v, 0] + x[i])
+            # All three numbers of a direction are not-a-number, or none is.
             if not math.isnan(table[first]):
                 dx, dy, dz = (
                     np.float64(table[first]),

@@ -43,8 +43,9 @@ def _wood_grain(xyz: TexturePoints, light: str, dark: str, seed: int) -> Colors:
 
 def table_wood(xyz: TexturePoints, uv: UvCoordinates) -> Colors:
     """Return the albedo of oiled planks with dark seams."""
-    plank = np.floor(xyz[:, 1] / 0.19 + 0.5)
+    plank = np.floor(xyz[:, 1] / 0.19 + 0.5)  # 0.19 m a plank
     shade = cell_noise(plank, np.zeros_like(plank), seed=3)
+    # Each plank is cut from another place of the wood.
     shifted = xyz + np.stack([7 * shade, 3 * shade, 5 * shade], axis=1)
     colors = _wood_grain(shifted, "d9a066", "8a5428", seed=20) * grey_column(0.72 + 0.5 * shade)
     seam = np.abs(np.mod(xyz[:, 1] / 0.19 + 0.5, 1) - 0.5) > 0.485
@@ -191,7 +192,7 @@ def tower_bricks(xyz: TexturePoints, uv: UvCoordinates) -> Colors:
     """Return the albedo of small bricks with mortar, and a band of letters on each side."""
     u, v = uv[:, 0], uv[:, 1]
     course = v / 0.032
-    along = u / 0.07 + 0.5 * np.mod(np.floor(course), 2)
+    along = u / 0.07 + 0.5 * np.mod(np.floor(course), 2)  # every second course is offset by half a brick
     tone = cell_noise(along, course, seed=63)
     colors = lerp(linear_from_hex("b9573b"), linear_from_hex("d9a07a"), tone)
     colors = lerp(colors, linear_from_hex("6f7f86"), (tone > 0.86).astype(np.float32))
@@ -199,6 +200,7 @@ def tower_bricks(xyz: TexturePoints, uv: UvCoordinates) -> Colors:
     mortar = np.maximum(box_mask(np.mod(course, 1), 0.0, 0.13), box_mask(np.mod(along, 1), 0.0, 0.06))
     colors = lerp(colors, linear_from_hex("cfc6b4"), mortar)
     sign = box_mask(v, 0.30, 0.40)
+    # From the middle of a side, in metres: u has 10 m a side
     across = np.mod(u + 5, 10) - 5
     ink = text_mask(across / 0.042 + 2.5, (v - 0.386) / 0.1, ["SPLAT"]) * box_mask(across, -0.104, 0.104)
     return lerp(colors, lerp(linear_from_hex("f5efe0"), linear_from_hex("22333b"), ink), sign)
@@ -233,7 +235,7 @@ def cube_paint(xyz: TexturePoints, uv: UvCoordinates) -> Colors:
     colors = colors * grey_column(0.95 + 0.2 * gradient_noise(xyz * np.float32(40), octaves=3, seed=68))
     medal = octagon_pattern(across / 0.4 + 0.5, up / 0.4 + 0.5, 0.27)
     colors = lerp(colors, linear_from_hex("fdf6e3"), medal)
-    face = (2 * axis + (sign > 0)).astype(np.float32)
+    face = (2 * axis + (sign > 0)).astype(np.float32)  # a letter a face
     ink = text_mask((across + 0.065) / 0.156 + np.clip(face, 0, 5), (up - 0.075) / 0.215, ["OCTAGS"])
     near = (np.abs(across) < 0.066) & (np.abs(up) < 0.08)
     return lerp(colors, linear_from_hex("d1495b"), ink * near * medal)

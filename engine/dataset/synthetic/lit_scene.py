@@ -91,6 +91,7 @@ class LitScene:
                 starts[up], np.broadcast_to(20 * direction, (len(up), 3))
             )
             sky = np.zeros(3) if direction[2] <= 0 else _sky_radiance(direction[None])[0]
+            # 4 pi / n steradians a direction, over pi for a diffuse surface
             light += (4 / len(directions)) * cosine[:, None] * (free * sky + (1 - free) * _INDIRECT_LIGHT)
         return light.astype(np.float32), visibility.astype(np.float32)
 

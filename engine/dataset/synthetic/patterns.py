@@ -118,6 +118,7 @@ def octagon_pattern(
 ) -> Float32[np.ndarray, " n"]:
     """Return 1 in regular octagons of apothem ``radius`` at the centres of unit squares, else 0."""
     x, y = np.abs(np.mod(first, 1) - 0.5), np.abs(np.mod(second, 1) - 0.5)
+    # The slanted sides have the same apothem.
     reach = np.maximum(np.maximum(x, y), (x + y) * np.float32(np.sqrt(0.5)))
     return (reach < radius).astype(np.float32)
 

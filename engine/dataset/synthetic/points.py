@@ -89,7 +89,7 @@ def _points_under_pixels(
     origins, along = (np.concatenate(parts) for parts in zip(*rays, strict=True))
     hits = scene.trace(origins, along)
     colors = scene.shade_hits(hits, origins, along).reshape(-1, 9, 3).mean(axis=1)
-    middle = slice(4, None, 9)
+    middle = slice(4, None, 9)  # the pixel itself among its 3 x 3 samples
     face = hits.faces[middle]
     selected: Bool[np.ndarray, " n"] = face >= 0
     if objects_only:
@@ -107,6 +107,7 @@ def _project_unoccluded(
     inside = np.flatnonzero(np.isfinite(pixels[:, 0]))
     ways = (xyz[inside] - view.centre_world).astype(np.float32)
     origins = np.broadcast_to(view.centre_world.astype(np.float32), ways.shape).copy()
+    # Distances count in lengths of the way: the point itself lies at 1.
     hidden = scene.trace(origins, ways).distances < _VISIBILITY_TOLERANCE
     pixels[inside[hidden]] = np.nan
     return pixels

@@ -40,7 +40,7 @@ def _vertex_normals(
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     across = np.cross(b - a, c - a)
     _, place = np.unique(np.round(vertices, 6), axis=0, return_inverse=True)
-    place = place.reshape(-1)
+    place = place.reshape(-1)  # NumPy 2.0 gives the inverse a second axis
     sums = np.zeros((place.max() + 1, 3))
     for k in range(3):
         np.add.at(sums, place[faces[:, k]], across)
@@ -129,6 +129,7 @@ def surface_of_revolution(profile: Float[np.ndarray, "k 2"], columns: int) -> Te
     angle = np.linspace(0, 2 * np.pi, columns + 1)
     radius, height = profile[:, :1], profile[:, 1:]
     points = np.stack(np.broadcast_arrays(radius * np.cos(angle), radius * np.sin(angle), height), axis=-1)
+    # Exactly the first column: the rounded sine of a full turn would open the seam.
     points[:, -1] = points[:, 0]
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(profile, axis=0), axis=1))])
     uv = np.stack(np.broadcast_arrays(angle / (2 * np.pi), way[:, None]), axis=-1)
@@ -144,6 +145,7 @@ def catmull_rom_profile(knots: Float[np.ndarray, "k 2"], steps: int) -> Float[np
         for a, b, c, d in zip(padded, padded[1:], padded[2:], padded[3:], strict=False)
     ]
     curve = np.concatenate([*pieces, knots[-1:]])
+    # The spline may swing past the axis.
     curve[:, 0] = np.maximum(curve[:, 0], 0)
     return curve
 
@@ -157,6 +159,7 @@ def torus_knot_mesh(size: float, tube: float, columns: int, rows: int) -> Textur
     ring = 2 + np.cos(3 * t)
     centre = size * np.stack([ring * np.cos(2 * t), ring * np.sin(2 * t), 1.3 * np.sin(3 * t)], axis=-1)
     spoke = np.stack([np.cos(2 * t), np.sin(2 * t), np.zeros_like(t)], axis=-1)
+    # The knot is closed: neighbors across its end are the last but one and the second point.
     ahead = np.gradient(np.concatenate([centre[-2:-1], centre, centre[1:2]]), axis=0)[1:-1]
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
     side = np.cross(ahead, spoke)
@@ -174,6 +177,7 @@ def _sphere_grid(columns: int, rows: int) -> tuple[Float[np.ndarray, "r c 3"], F
     """Return unit vectors on a longitude-latitude grid; uv: turns, and half turns from the bottom."""
     u, v = np.meshgrid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1))
     across = np.sin(np.pi * v)
+    # The rounded sine of pi is above 0, and would give the triangles at a pole an area.
     across[[0, -1]] = 0
     directions = np.stack(
         [across * np.cos(2 * np.pi * u), across * np.sin(2 * np.pi * u), -np.cos(np.pi * v)], axis=-1

@@ -53,5 +53,6 @@ def write_dataset_files(
                 photograph.result()
                 progress(done, len(views))
         except BaseException:
+            # After an error or an interruption the other photographs need not be rendered.
             pool.shutdown(wait=True, cancel_futures=True)
             raise

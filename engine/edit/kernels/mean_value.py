@@ -102,7 +102,7 @@ def _winding_block(
             corners = _row_addresses(offsets.ctypes.data, triangles, t, VERTEX_BYTES)
             add_solid_angle(corners, total.ctypes.data)
         for lane in range(min(LANES, len(points) - first)):
-            result[first + lane] = np.int64(np.rint(total[0, lane] / TURN))
+            result[first + lane] = np.int64(np.rint(total[0, lane] / TURN))  # half angles: 2 pi a turn
 
 
 @kernel(error_model="numpy")
@@ -216,6 +216,7 @@ def _boundary_coordinates(
             volume = x * to_corners[k, 0] + y * to_corners[k, 1] + z * to_corners[k, 2]
         sine = areas[0] / (lengths[1] * lengths[2])
         volume /= lengths[0] * lengths[1] * lengths[2]
+        # Twice the tolerances of add_means_in_plane(): rounding here must not miss what it found.
         if abs(volume) <= 2.0 * FLAT_TOLERANCE * sine and angle_sum >= TURN - 2 * TURN_TOLERANCE:
             total = areas[0] + areas[1] + areas[2]
             for k in range(3):

@@ -77,6 +77,7 @@ def _angle(sine: Vector, cosine: Vector) -> Vector:
     small, large = beyond.select(ahead, sine), beyond.select(sine, ahead)
     # Beyond an eighth of a half turn, what is missing to two eighths.
     steep = small > large * STEEP_LIMIT
+    # tan(angle - pi / 4) = (small - large) / (small + large)
     z = steep.select(small - large, small) / steep.select(small + large, large).maximum(TINY_LENGTH)
     angle = _polynomial(ARCTANGENT, z * z) * z
     angle = steep.select(angle + math.pi / 4, angle)
@@ -265,6 +266,7 @@ def add_solid_angle(
     ) -> ir.Value:
         a, b, c = (_read_direction(builder, builder.extract_value(args[0], k)) for k in range(3))
         volume = _dot(a, _cross(b, c))
+        # tan(solid angle / 2) = a . (b x c) / (1 + a . b + b . c + c . a) for unit vectors
         angle = _angle(abs(volume), _dot(a, b) + _dot(b, c) + _dot(c, a) + 1.0)
         rows = VectorRows(builder, args[1], DOUBLE8)
         rows[0] = rows[0] + (volume < 0.0).select(angle * -1.0, angle)

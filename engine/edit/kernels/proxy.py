@@ -32,17 +32,17 @@ def point_triangle_distance(
     d5, d6 = d1 - bc, d2 - cc
     va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
     if d1 <= 0.0 and d2 <= 0.0:
-        pass
+        pass  # corner a
     elif d3 >= 0.0 and d4 <= d3:
-        v = 1.0
+        v = 1.0  # corner b
     elif d6 >= 0.0 and d5 <= d6:
-        w = 1.0
+        w = 1.0  # corner c
     elif vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        v = d1 / (d1 - d3)
+        v = d1 / (d1 - d3)  # edge ab
     elif vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        w = d2 / (d2 - d6)
+        w = d2 / (d2 - d6)  # edge ac
     elif va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
-        w = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        w = (d4 - d3) / ((d4 - d3) + (d5 - d6))  # edge bc
         v = 1.0 - w
     else:
         total = va + vb + vc
@@ -84,6 +84,7 @@ def triangle_weights(
         for k in range(width):
             triangle = candidates[i, k]
             known = False
+            # Several samples of one triangle may be among the candidates.
             for other in range(count):
                 if found[other] == triangle:
                     known = True

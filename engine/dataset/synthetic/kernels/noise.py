@@ -11,7 +11,9 @@ def _hash(x: int, y: int, z: int, seed: int) -> np.uint32:
     """Return 32 well mixed bits of an integer lattice point."""
     h = np.uint32(x) * np.uint32(0x8DA6B343) ^ np.uint32(y) * np.uint32(0xD8163841)
     h = np.uint32(h) ^ np.uint32(z) * np.uint32(0xCB1AB31F) ^ np.uint32(seed) * np.uint32(0x9E3779B1)
+    # Numba widens 32-bit integers in arithmetic, so that each step is cut back to 32 bits.
     h = np.uint32(h)
+    # Finalizer [15 2c1b3c6d 12 297a2d39 15] of Wellons' hash-prospector
     h = np.uint32((h ^ (h >> np.uint32(15))) * np.uint32(0x2C1B3C6D))
     h = np.uint32((h ^ (h >> np.uint32(12))) * np.uint32(0x297A2D39))
     return np.uint32(h ^ (h >> np.uint32(15)))
@@ -21,6 +23,7 @@ def _hash(x: int, y: int, z: int, seed: int) -> np.uint32:
 def hash_cells(cells: Int[np.ndarray, "n 3"], seed: int, out: Float32[np.ndarray, " n"]) -> None:
     """Write a number in [0, 1) of every integer cell (n, 3), into ``out`` (n,)."""
     for i in range(cells.shape[0]):
+        # The upper 24 bits: as many as a float32 holds exactly
         out[i] = np.float32(_hash(cells[i, 0], cells[i, 1], cells[i, 2], seed) >> np.uint32(8)) / np.float32(
             1 << 24
         )
@@ -29,7 +32,7 @@ def hash_cells(cells: Int[np.ndarray, "n 3"], seed: int, out: Float32[np.ndarray
 @device_function(inline="always")
 def _gradient_dot(h: np.uint32, dx: np.float32, dy: np.float32, dz: np.float32) -> np.float32:
     """Return the height at an offset from a lattice point, on the plane that the hash gives to that point."""
-    scale = np.float32(1.0 / 511.5)
+    scale = np.float32(1.0 / 511.5)  # 10 bits a component, to [-1, 1]
     gx = np.float32(h & np.uint32(1023)) * scale - np.float32(1)
     gy = np.float32((h >> np.uint32(10)) & np.uint32(1023)) * scale - np.float32(1)
     gz = np.float32((h >> np.uint32(20)) & np.uint32(1023)) * scale - np.float32(1)
@@ -67,6 +70,7 @@ def fractal_noise(
             far = (a + (b - a) * wx) + ((c + (d - c) * wx) - (a + (b - a) * wx)) * wy
             total += strength * (near + (far - near) * wz)
             strength *= np.float32(0.5)
+            # Not 2, or the zeros of all octaves at lattice points would fall together
             px, py, pz = px * np.float32(2.03), py * np.float32(2.03), pz * np.float32(2.03)
         out[i] = total
 
