@@ -1,8 +1,11 @@
 """Base of the middleware of the service."""
 
+import re
 from abc import ABC, abstractmethod
 
 from starlette.types import ASGIApp, Receive, Scope, Send
+
+_UPLOAD_PATH = re.compile(r"/v1/datasets/[^/]+/uploads/[^/]+")
 
 
 class HttpMiddleware(ABC):
@@ -25,3 +28,9 @@ class HttpMiddleware(ABC):
     @abstractmethod
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request, or pass it on."""
+
+
+def is_file_content(scope: Scope) -> bool:
+    """Return whether the body of a request is content of a file, which only its route reads and counts."""
+    is_part = scope["method"] == "PATCH" and _UPLOAD_PATH.fullmatch(scope["path"]) is not None
+    return is_part or scope["method"] == "PUT"

@@ -12,7 +12,7 @@ from typing import Any
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from octasplat.service.http_middleware import HttpMiddleware
+from octasplat.service.http_middleware import HttpMiddleware, is_file_content
 from octasplat.service.problems import ProblemError
 from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
 
@@ -45,7 +45,7 @@ class JsonBoundsMiddleware(HttpMiddleware):
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, or answer 422."""
-        if scope["method"] == "PUT" or "json" not in Headers(scope=scope).get("content-type", "").lower():
+        if is_file_content(scope) or "json" not in Headers(scope=scope).get("content-type", "").lower():
             await self._app(scope, receive, send)
             return
         pieces, is_complete = [], False
@@ -85,6 +85,8 @@ def find_excess(body: bytes, max_values: int = MAX_VALUES) -> tuple[str, str] | 
         body: the text, which may be no JSON.
         max_values: most values within it, at any depth.
     """
+    if json.detect_encoding(body) not in ("utf-8", "utf-8-sig"):
+        return "encoding", "JSON is read in UTF-8 only."  # the parser takes others, whose brackets differ
     too_many = ("too_many_values", f"The request has more than {max_values} values.")
     pieces, end = [], 0
     for number, found in enumerate(_STRING.finditer(body)):

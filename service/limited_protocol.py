@@ -144,20 +144,23 @@ class LimitedProtocol(H11Protocol):
     def close_if_overdue(self, limits: ConnectionLimits) -> None:
         """Close the connection if it has kept the front end waiting for too long."""
         seconds = time.monotonic() - self.waiting_since
-        if self._has_partial_headers:
+        if self.flow.write_paused or self.transport.is_closing():
+            self._close_if_not_reading(limits.reader_seconds)  # whatever else it owes
+        elif self._has_partial_headers:
             if seconds > limits.header_seconds:
                 self.transport.write(_answer("408 Request Timeout"))
                 self.transport.close()
         elif self._is_waiting_for_body:
             if seconds > limits.body_seconds:
                 self.transport.close()
-        elif self.flow.write_paused:
-            self._close_if_not_reading(limits.reader_seconds)
         elif not self.is_waiting_for_request:
             self._restart_clock()
 
     def _close_if_not_reading(self, reader_seconds: float) -> None:
-        """Close the connection of a client that takes nothing of an answer, or next to nothing."""
+        """Close the connection of a client that takes nothing of an answer, or next to nothing.
+
+        One that is closed otherwise stays until the client has taken what was written before.
+        """
         unsent = self.transport.get_write_buffer_size() + _unacknowledged_bytes(self.transport)
         before = self._unsent_bytes
         # More than before: all of that was taken, and more was written since.

@@ -9,7 +9,7 @@ from starlette.middleware.body_limit import RequestBodyLimitMiddleware
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from octasplat.service.http_middleware import HttpMiddleware
+from octasplat.service.http_middleware import HttpMiddleware, is_file_content
 from octasplat.service.problems import ProblemError
 
 _LOCAL_HOSTS = frozenset({"localhost", "127.0.0.1", "::1"})
@@ -84,7 +84,7 @@ class BodyLimitMiddleware:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on with its limit."""
-        if scope["type"] != "http" or scope["method"] == "PUT" or _is_part_of_upload(scope):
+        if scope["type"] != "http" or is_file_content(scope):
             await self._app(scope, receive, send)
             return
         replaced = False
@@ -102,11 +102,6 @@ class BodyLimitMiddleware:
 
         limited = (app for prefix, app in self._longer.items() if scope["path"].startswith(prefix))
         await next(limited, self._limited)(scope, receive, send_as_problem)
-
-
-def _is_part_of_upload(scope: Scope) -> bool:
-    """Return whether a request sends a part of a file that is uploaded in parts."""
-    return bool(scope["method"] == "PATCH" and _UPLOAD_PATH.fullmatch(scope["path"]))
 
 
 class CompressionMiddleware:
@@ -149,7 +144,6 @@ class SecurityHeadersMiddleware(HttpMiddleware):
 _STORED_CONTENT = re.compile(
     r"/v1/(jobs|datasets)/[^/]+/((artifacts|files)/.+|preview|archive|events)", re.DOTALL
 )
-_UPLOAD_PATH = re.compile(r"/v1/datasets/[^/]+/uploads/[^/]+")
 _PLAIN_TEXT_HEADER = (b"content-type", b"text/plain; charset=utf-8")
 _SECURITY_HEADERS = (
     (b"x-content-type-options", b"nosniff"),

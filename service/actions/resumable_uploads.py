@@ -24,7 +24,7 @@ from octasplat.service.state import Service
 from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
 from octasplat.workers.db import uploads as rows
 from octasplat.workers.db.connections import Connection, retry_on_deadlock
-from octasplat.workers.db.dataset_tasks import DatasetTask
+from octasplat.workers.db.dataset_tasks import DatasetTask, get_task
 from octasplat.workers.db.datasets import get_dataset
 from octasplat.workers.db.errors import ConflictError
 from octasplat.workers.db.locks import lock_owner
@@ -157,7 +157,9 @@ async def delete_upload(
     async with service.pool.connection() as connection, connection.transaction():
         await fetch_visible_dataset(connection, principal, dataset_id)
         upload = await _upload_in(connection, dataset_id, upload_id)
-        if upload.task_id is not None:
+        await lock_owner(connection, upload.owner)
+        upload = await _upload_in(connection, dataset_id, upload_id, lock=True)
+        if await _is_being_stored(connection, upload):
             raise ConflictError("All of the upload has come, and the file is being stored.")
         await rows.delete_upload(connection, upload)
     service.evictor.evict_if_low_later()
@@ -176,7 +178,7 @@ async def run_upload(service: Service, task: DatasetTask) -> TaskOutcome:
     try:
         result = await uploads.store_named(service, owner, task.dataset_id, upload.path, body)
     except (StorageFullError, StorageUnavailableError) as error:
-        return TaskOutcome(problem=problem_from_error(error), apply=partial(_wait, upload=upload))
+        return TaskOutcome(problem=problem_from_error(error))
     except OctasplatError as error:
         return TaskOutcome(problem=problem_from_error(error), apply=delete)
     return TaskOutcome(result, apply=delete)
@@ -184,11 +186,6 @@ async def run_upload(service: Service, task: DatasetTask) -> TaskOutcome:
 
 async def _delete(connection: Connection, upload: FileUpload) -> None:
     await rows.delete_upload(connection, upload)
-
-
-async def _wait(connection: Connection, upload: FileUpload) -> None:
-    """Let another request begin the storing again."""
-    await rows.set_task(connection, upload.id, None)
 
 
 async def _content(storage: Storage, parts: Sequence[UploadPart]) -> AsyncIterator[bytes]:
@@ -201,12 +198,16 @@ async def _content(storage: Storage, parts: Sequence[UploadPart]) -> AsyncIterat
 
 @retry_on_deadlock
 async def _store_if_whole(service: Service, upload: FileUpload) -> FileUpload:
-    """Begin the task that stores an upload of which all has come; returns the upload as it is."""
+    """Begin the task that stores an upload of which all has come, again if the last one failed.
+
+    Returns:
+        The upload as it is.
+    """
     async with service.pool.connection() as connection, connection.transaction():
         found = await rows.get_upload(connection, upload.id, lock=True)
         if found is None:
             raise not_found_error("upload")
-        if found.offset_bytes == found.size_bytes and found.task_id is None:
+        if found.offset_bytes == found.size_bytes and not await _is_being_stored(connection, found):
             dataset = await get_dataset(connection, found.dataset_id)
             assert dataset is not None
             task = await new_task(service, connection, dataset, "upload", {"upload_id": str(found.id)})
@@ -238,8 +239,16 @@ async def _check_room(service: Service, connection: Connection, owner: str, size
         )
 
 
-async def _upload_in(connection: Connection, dataset_id: uuid.UUID, upload_id: uuid.UUID) -> FileUpload:
-    upload = await rows.get_upload(connection, upload_id)
+async def _is_being_stored(connection: Connection, upload: FileUpload) -> bool:
+    """Return whether a task on an upload waits or is worked on."""
+    task = None if upload.task_id is None else await get_task(connection, upload.task_id)
+    return task is not None and not task.is_over
+
+
+async def _upload_in(
+    connection: Connection, dataset_id: uuid.UUID, upload_id: uuid.UUID, *, lock: bool = False
+) -> FileUpload:
+    upload = await rows.get_upload(connection, upload_id, lock=lock)
     if upload is None or upload.dataset_id != dataset_id:
         raise not_found_error("upload")
     return upload

@@ -60,7 +60,8 @@ class TaskRunner:
         while True:
             try:
                 await self._look_after_tasks()
-                await self._begin_tasks()
+                if not self._service.is_draining:
+                    await self._begin_tasks()
             except _DATABASE_ERRORS as error:
                 logger.info("not looking for tasks for a moment: %s", error)
             except Exception:

@@ -137,6 +137,12 @@ async def put_file(
         StorageError: it is not as announced, or there is no room.
     """
     check_not_draining(service)
+    return await _store_file(service, principal, dataset_id, path, upload)
+
+
+async def _store_file(
+    service: Service, principal: Principal, dataset_id: uuid.UUID, path: str, upload: Upload
+) -> StoredFile:
     async with service.pool.connection() as connection:
         dataset = await open_dataset(connection, principal, dataset_id)
         check = check_file_name_of(dataset, path)
@@ -182,6 +188,12 @@ async def put_archive(
         StorageError: it is not as announced, or there is no room.
     """
     check_not_draining(service)
+    return await _store_archive(service, principal, dataset_id, upload)
+
+
+async def _store_archive(
+    service: Service, principal: Principal, dataset_id: uuid.UUID, upload: Upload
+) -> StoredArchive:
     async with service.pool.connection() as connection:
         dataset = await open_dataset(connection, principal, dataset_id)
         left = await bytes_left(connection, dataset.owner, service.settings.quota)
@@ -222,13 +234,15 @@ async def store_named(
 ) -> dict[str, Any]:
     """Store a file, or a ZIP file's if ``path`` is None; returns what a task tells of it.
 
+    Also while the service is about to stop, as the task goes on elsewhere if it does not end here.
+
     Raises:
         Exception: as by :func:`put_file` and :func:`put_archive`.
     """
     if path is not None:
-        await put_file(service, principal, dataset_id, path, upload)
+        await _store_file(service, principal, dataset_id, path, upload)
         return {"files": 1, "left_out": [], "notes": []}
-    stored = await put_archive(service, principal, dataset_id, upload)
+    stored = await _store_archive(service, principal, dataset_id, upload)
     left_out = list(stored.left_out[:MAX_LEFT_OUT])
     return {"files": len(stored.files), "left_out": left_out, "notes": list(stored.notes)}
 

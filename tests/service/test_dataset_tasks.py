@@ -2,6 +2,7 @@
 
 import asyncio
 import threading
+import uuid
 from collections.abc import Callable
 from typing import Any
 
@@ -14,7 +15,7 @@ from octasplat.service.intake.dataset import DatasetSummary
 from octasplat.service.intake.faults import IntakeError, IntakeFault
 from octasplat.service.routes.preferences import seconds_to_wait
 from octasplat.workers.db import dataset_tasks as rows
-from octasplat.workers.db.datasets import reopen_stale_checks
+from octasplat.workers.db.datasets import begin_check, end_check, reopen_stale_checks
 from tests.support.service_harness import ConnectService, task_over
 
 PATIENCE_SECONDS = 60.0
@@ -117,6 +118,48 @@ async def test_commit_goes_on_at_the_next_front_end(
             cursor = await connection.execute("SELECT attempt FROM dataset_tasks")
             assert await cursor.fetchone() == {"attempt": 1}  # who hands back does not count
     assert check.begun == 2
+
+
+async def test_front_end_that_is_about_to_stop_begins_no_tasks(
+    connect_service: ConnectService, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(task_runner, "POLL_SECONDS", 0.02)
+    async with connect_service() as (http, service):
+        dataset = await new_dataset(http)
+        service.is_draining = True
+        async with service.pool.connection() as connection:
+            task = await rows.add_task(connection, uuid.UUID(dataset.rpartition("/")[2]), "local", "commit")
+        await asyncio.sleep(0.5)
+        answer = httpx.Response(202, headers={"Location": f"{dataset}/tasks/{task.id}"})
+        assert (await http.get(answer.headers["Location"])).json()["state"] == "queued"
+    async with connect_service(has_token=False) as (http, _):
+        problem = (await task_over(http, answer))["problem"]
+        assert problem["type"] == "urn:octasplat:problem:dataset-photographs"
+
+
+async def test_check_that_begins_beside_an_announcement_keeps_its_dataset(
+    connect_service: ConnectService, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(task_runner, "KEEP_ANNOUNCED_SECONDS", 1e6)
+    async with connect_service() as (http, service):
+        service.is_draining = True
+        dataset = uuid.UUID((await new_dataset(http)).rpartition("/")[2])
+        async with service.pool.connection() as connection:
+            await rows.add_task(connection, dataset, "local", "commit")
+            await connection.execute(
+                "UPDATE datasets SET state = 'checking', used_at = now() - interval '30 s'"
+            )
+        async with service.pool.connection() as other, service.pool.connection() as ours:
+            async with ours.transaction():
+                assert await rows.claim_task(ours, "commit", max_per_owner=1) is not None
+                check = await begin_check(ours, dataset)
+                # It has seen the task while it was still queued, and waits for the row of the dataset.
+                announcing = asyncio.create_task(rows.keep_announced_checks(other))
+                await asyncio.sleep(0.3)
+                assert not announcing.done()
+            await announcing
+            await other.commit()
+            assert (await end_check(ours, check, is_valid=True)).state == "committed"
 
 
 async def _kill(*_: object) -> None:

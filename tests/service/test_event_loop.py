@@ -188,3 +188,14 @@ def test_excess_is_found_in_the_structure_alone() -> None:
     ):
         found = find_excess(body)
         assert found is not None and found[0] == code
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be", "utf-32"])
+async def test_json_is_read_in_utf_8_alone(connect_service: ConnectService, encoding: str) -> None:
+    # Bytes of these characters are quotation marks, which would hide the brackets behind them.
+    body = ('{"name": "\u2200", "x": ' + "[" * 100 + "]" * 100 + "}").encode(encoding)
+    found = find_excess(body)
+    assert found is not None and found[0] == "encoding"
+    async with connect_service() as (http, _):
+        answer = await http.post("/v1/datasets", content=body, headers={"Content-Type": "application/json"})
+        assert answer.status_code == 422 and "UTF-8" in answer.json()["detail"]

@@ -1,7 +1,9 @@
 """Connections that send nothing, or too slowly, keep nobody else out and fill no log."""
 
+import asyncio
 import contextlib
 import http.client
+import io
 import resource
 import socket
 import subprocess
@@ -12,9 +14,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import httpx
+import numpy as np
 import pytest
+from PIL import Image
+from starlette.types import Receive, Scope, Send
+from uvicorn.server import ServerState
 
-from tests.support.service_harness import api_environment
+from octasplat.service.connection_limits import ConnectionLimits
+from octasplat.service.limited_protocol import ConnectionTable, LimitedConfig, LimitedProtocol
+from tests.support.service_harness import BEARER, api_environment
 
 ROOT = Path(__file__).parents[2]
 OPEN_FILES = 256
@@ -129,6 +137,57 @@ def test_clients_that_do_not_read_are_not_waited_for(start_front_end: StartFront
         time.sleep(12)
         assert read_all(connection, 60, 0.0) < 0
         assert front_end.healthz_seconds() < 5
+
+
+def test_clients_that_do_not_read_are_not_waited_for_while_they_owe_a_body(
+    start_front_end: StartFrontEnd,
+) -> None:
+    with start_front_end(READER_SECONDS="2") as front_end, front_end.connect() as connection:
+        address = f"http://{front_end.address[0]}:{front_end.address[1]}"
+        with httpx.Client(base_url=address, headers=BEARER, timeout=60) as http:
+            dataset = http.post("/v1/datasets", json={"name": "d"}).headers["Location"]
+            picture = io.BytesIO()
+            noise = np.random.default_rng(0).integers(0, 256, (2400, 2400, 3), dtype=np.uint8)
+            Image.fromarray(noise).save(picture, "PNG", compress_level=0)
+            assert http.put(f"{dataset}/files/images/a.png", content=picture.getvalue()).status_code == 201
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 14)
+        asked = LARGE.replace(b"/openapi.json", f"{dataset}/files/images/a.png".encode())
+        asked = asked.replace(b"\r\n\r\n", f"\r\nAuthorization: {BEARER['Authorization']}\r\n".encode())
+        connection.sendall(asked + b"Content-Length: 1\r\n\r\n")
+        time.sleep(12)
+        assert read_all(connection, 1, 0.0) < 0
+
+
+async def test_closed_connection_goes_also_where_the_end_of_an_answer_is_not_read() -> None:
+    made: list[LimitedProtocol] = []
+
+    async def answer(_scope: Scope, _receive: Receive, send: Send) -> None:
+        headers = [(b"connection", b"close"), (b"transfer-encoding", b"chunked")]
+        await send({"type": "http.response.start", "status": 200, "headers": headers})
+        while made[0].transport.get_write_buffer_size() == 0:  # what the system takes
+            await send({"type": "http.response.body", "body": bytes(4096), "more_body": True})
+        await send({"type": "http.response.body", "body": bytes(20_000)})
+
+    limits = ConnectionLimits(10, 10, header_seconds=60.0, body_seconds=60.0, reader_seconds=0.3)
+    config = LimitedConfig(answer, lifespan="off", log_config=None)
+    config.load()
+    config.connections = ConnectionTable(limits)
+
+    def make() -> LimitedProtocol:
+        made.append(LimitedProtocol(config, ServerState(), {}))
+        return made[0]
+
+    server = await asyncio.get_running_loop().create_server(make, "127.0.0.1", 0)
+    with socket.create_connection(server.sockets[0].getsockname()) as connection:
+        connection.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        async with asyncio.timeout(30):
+            while not (made and made[0].transport.is_closing()):
+                await asyncio.sleep(0.02)
+            assert made[0].transport.get_write_buffer_size() > 0 and not made[0].flow.write_paused
+            while made[0].transport.get_write_buffer_size() > 0:
+                config.connections.close_overdue()
+                await asyncio.sleep(0.1)
+    server.close()
 
 
 def test_clients_that_read_slowly_get_everything(start_front_end: StartFrontEnd) -> None:

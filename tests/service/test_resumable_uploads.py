@@ -8,10 +8,12 @@ import subprocess
 import sys
 import threading
 import time
+import uuid
 import zipfile
 from collections.abc import AsyncIterator
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
@@ -19,9 +21,12 @@ import psycopg
 import pytest
 from PIL import Image
 
+from octasplat.service.actions import task_runner, uploads
 from octasplat.service.intake import receive
+from octasplat.service.state import Service
 from octasplat.workers.client.api import Api
 from octasplat.workers.client.upload import upload_scene
+from octasplat.workers.db.dataset_tasks import DatasetTask
 from octasplat.workers.maintenance.garbage_collection import collect_garbage_now
 from octasplat.workers.maintenance.retention import apply_retention
 from octasplat.workers.settings import Retention
@@ -174,6 +179,89 @@ async def test_parts_count_for_their_owner_and_are_not_collected(
         await send(http, again, 0, content[:10])
         assert (await http.delete(dataset)).status_code == 204
         assert (await http.get("/v1/usage")).json()["bytes"]["used"] == 0
+
+
+async def test_part_that_is_called_json_is_not_read_before_it_is_known_who_sends_it(
+    connect_service: ConnectService,
+) -> None:
+    pieces = 0
+
+    async def body() -> AsyncIterator[bytes]:
+        nonlocal pieces
+        for _ in range(200):
+            pieces += 1
+            yield b" " * 1000
+
+    async with connect_service(signed_in=False) as (http, _):
+        headers = {**PART, "Content-Type": "application/json", "Upload-Offset": "0"}
+        address = f"/v1/datasets/{uuid.uuid4()}/uploads/{uuid.uuid4()}"
+        assert (await http.patch(address, content=body(), headers=headers)).status_code == 401
+        assert pieces < 5
+
+
+async def test_upload_is_stored_while_the_service_ends_its_last_requests(
+    connect_service: ConnectService, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_upload = task_runner.run_upload
+
+    async def run_when_draining(service: Service, task: DatasetTask) -> Any:
+        service.is_draining = True
+        return await run_upload(service, task)
+
+    monkeypatch.setattr(task_runner, "run_upload", run_when_draining)
+    async with connect_service() as (http, _):
+        dataset = await new_dataset(http)
+        upload = await new_upload(http, dataset, PICTURE, path="images/a.png")
+        last = await send(http, upload, 0, PICTURE)
+        task = await task_over(http, httpx.Response(202, headers={"Location": last.headers["Location"]}))
+        assert task["state"] == "succeeded", task["problem"]
+
+
+async def test_upload_whose_storing_was_given_up_is_begun_again_or_deleted(
+    connect_service: ConnectService, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def fail(*_: object) -> Any:
+        raise RuntimeError("a fault of the service")
+
+    async with connect_service() as (http, _):
+        dataset = await new_dataset(http)
+        with monkeypatch.context() as patch:
+            patch.setattr(uploads, "store_named", fail)
+            addresses = [await new_upload(http, dataset, PICTURE, path=f"images/{n}.png") for n in range(2)]
+            for upload in addresses:
+                last = await send(http, upload, 0, PICTURE)
+                answer = httpx.Response(202, headers={"Location": last.headers["Location"]})
+                assert (await task_over(http, answer))["state"] == "failed"
+        again = await send(http, addresses[0], len(PICTURE), b"")
+        task = await task_over(http, httpx.Response(202, headers={"Location": again.headers["Location"]}))
+        assert task["state"] == "succeeded"
+        assert (await http.delete(addresses[1])).status_code == 204
+        listed = (await http.get(f"{dataset}/files")).json()["files"]
+        assert [file["path"] for file in listed] == ["images/0.png"]
+
+
+async def test_upload_that_waits_to_be_stored_is_kept(
+    connect_service: ConnectService, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go_on, run_upload = asyncio.Event(), task_runner.run_upload
+
+    async def run_later(service: Service, task: DatasetTask) -> Any:
+        await go_on.wait()
+        return await run_upload(service, task)
+
+    monkeypatch.setattr(task_runner, "run_upload", run_later)
+    async with connect_service() as (http, service):
+        dataset = await new_dataset(http)
+        upload = await new_upload(http, dataset, PICTURE, path="images/a.png")
+        last = await send(http, upload, 0, PICTURE)
+        async with service.pool.connection() as connection:
+            await connection.execute("UPDATE uploads SET expires_at = now() - interval '1 hour'")
+        await apply_retention(service.pool, Retention(), 1000.0)
+        assert (await http.delete(upload)).status_code == 409
+        go_on.set()
+        task = await task_over(http, httpx.Response(202, headers={"Location": last.headers["Location"]}))
+        assert task["state"] == "succeeded"
+        assert (await http.get(f"{dataset}/files/images/a.png")).content == PICTURE
 
 
 CLIENT = """

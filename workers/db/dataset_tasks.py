@@ -20,6 +20,8 @@ LOST_SECONDS = 30
 """A task of which nothing was heard for so long is handed out again; its process is gone."""
 MAX_ATTEMPTS = 3
 """A task whose process is lost so often is given up."""
+ANNOUNCED_SECONDS = 10
+"""For so long a check counts as announced just now."""
 KEPT_DAYS = 7
 """For so long the outcome of a task can be asked for."""
 
@@ -237,15 +239,17 @@ async def requeue_lost_tasks(connection: Connection, problem: Mapping[str, Any])
 async def keep_announced_checks(connection: Connection) -> None:
     """Say that datasets whose commits wait are still to be checked.
 
-    Processes of the former version, which know nothing of tasks, would open them otherwise.
+    Processes of the former version, which know nothing of tasks, would open them otherwise. What was said a
+    moment ago stays: a task may have been claimed since this statement began, and its check is told by that.
     """
     await connection.execute(
         """
         UPDATE datasets SET used_at = clock_timestamp()
-        WHERE state = 'checking' AND id IN (
+        WHERE state = 'checking' AND used_at < clock_timestamp() - make_interval(secs => %s) AND id IN (
             SELECT dataset_id FROM dataset_tasks WHERE kind = 'commit' AND state = 'queued'
         )
-        """
+        """,
+        [ANNOUNCED_SECONDS],
     )
 
 

@@ -26,7 +26,7 @@ class FileUpload:
         sha256: its digest, if it was announced.
         metadata: what the client said of it, as it said it.
         offset_bytes: how much of it has come.
-        task_id: the task that stores the file, once all of it has come.
+        task_id: the newest task that stores the file, once all of it has come.
         expires_at: when it is given up unless more comes.
     """
 
@@ -121,8 +121,8 @@ async def add_part(connection: Connection, upload: FileUpload, part: UploadPart)
     )
 
 
-async def set_task(connection: Connection, upload_id: uuid.UUID, task_id: uuid.UUID | None) -> None:
-    """Say which task stores the file of an upload; None if one is to be begun again."""
+async def set_task(connection: Connection, upload_id: uuid.UUID, task_id: uuid.UUID) -> None:
+    """Say which task stores the file of an upload."""
     await connection.execute("UPDATE uploads SET task_id = %s WHERE id = %s", [task_id, upload_id])
 
 
@@ -133,11 +133,16 @@ async def delete_upload(connection: Connection, upload: FileUpload) -> None:
 
 
 async def delete_expired_uploads(connection: Connection) -> None:
-    """Delete uploads of which nothing has come for long."""
+    """Delete uploads of which nothing has come for long, but for those that are about to be stored."""
     cursor = await connection.execute("SELECT DISTINCT owner FROM uploads WHERE expires_at < now()")
     for row in await cursor.fetchall():
         async with connection.transaction():
             await lock_owner(connection, row["owner"])
             await connection.execute(
-                "DELETE FROM uploads WHERE owner = %s AND expires_at < now()", [row["owner"]]
+                """
+                DELETE FROM uploads WHERE owner = %s AND expires_at < now() AND NOT EXISTS (
+                    SELECT FROM dataset_tasks WHERE id = uploads.task_id AND state IN ('queued', 'running')
+                )
+                """,
+                [row["owner"]],
             )
