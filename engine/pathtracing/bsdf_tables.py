@@ -44,6 +44,7 @@ def albedo_table(ior: float | None) -> AlbedoTable:
     mean = (
         2.0 * (weighted[:, :-1] + 4.0 * between + weighted[:, 1:]).sum(axis=1) / (6.0 * (TABLE_COSINES - 1))
     )
+    # two equal columns, so that what interpolates over cosines can read it too
     return AlbedoTable(table, np.repeat(mean[:, None], 2, axis=1))
 
 

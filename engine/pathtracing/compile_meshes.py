@@ -182,6 +182,7 @@ class _MeshBuilder:
         self.corners.append(corners)
         self.normals.append(normals)
         self.rows.append(rows)
+        # the kernels need numbers: NaN marks corners without coordinates
         self.uv.append(np.zeros((len(corners), 3, 2), np.float32) if uv is None else np.nan_to_num(uv))
         self.rgb_linear.append(rgb_linear)
 
@@ -213,6 +214,7 @@ def _add_mesh(
     name = f"meshes[{number}]"
     materials = _face_materials(mesh, name, shape, warn)
     for chosen, given in materials:
+        # only the winding tells which side of glass is inside
         if isinstance(given.material, Glass) and (turned := turn_outwards(shape, chosen)) is not None:
             warn(f"{name}: {mesh.file} faces inwards; it is turned inside out, as glass needs an outside.")
             shape = turned
@@ -227,6 +229,7 @@ def _add_mesh(
     rows = np.empty(len(corners), np.int32)
     for chosen, given in materials:
         has_uv = shape.corner_uv is not None and bool(np.isfinite(shape.corner_uv[chosen]).all())
+        # a stage's own material replaces the file's colors as well
         tinted = mesh.material is None and shape.corner_rgb_linear is not None
         row = builder.table.add(
             given.material, f"{name}.material", has_uv=has_uv, uses_vertex_color=tinted, images=given.images
@@ -236,7 +239,7 @@ def _add_mesh(
             area = triangle_areas(corners[chosen])
             if not area.sum() > 0.0:
                 raise ConfigError(f"{name}: shines, but has no area; give it a surface, or no emission.")
-            own = np.flatnonzero(chosen)[area > 0.0]
+            own = np.flatnonzero(chosen)[area > 0.0]  # triangles without area have no density of samples
             texture = builder.table.set_emissive(row, builder.light_count + len(builder.emissive))
             radiance = given.material.emission * srgb_to_linear(np.array(given.material.emission_srgb))
             uv = np.zeros((len(own), 3, 2), np.float32)
@@ -260,6 +263,7 @@ def _face_materials(
     for value in np.unique(numbers):
         chosen = numbers == value
         if value < 0:
+            # white, as corner colors are factors
             plain = Diffuse(color_srgb=(1, 1, 1)) if shape.corner_rgb_linear is not None else Diffuse()
             found.append((chosen, ImportedMaterial(plain, {})))
             continue
@@ -294,10 +298,11 @@ def check_outside_glass(meshes: CompiledMeshes, origin_world: Float32[np.ndarray
         face = int(hit.faces[0])
         if face < 0:
             break
-        t = float(hit.distances[0]) * (1 + 1e-6) + 1e-9
+        t = float(hit.distances[0]) * (1 + 1e-6) + 1e-9  # beyond the hit, by more than its rounding
         row = int(meshes.surfaces.material_ids[face])
         corner = meshes.surfaces.corners_world[face].astype(np.float64)
         normal = np.cross(corner[1] - corner[0], corner[2] - corner[0])
+        # leaving counts up, entering down
         sides[row] = sides.get(row, 0) + (1 if float(direction[0] @ normal) > 0 else -1)
     if any(count > 0 and meshes.materials.kinds[row] == GLASS for row, count in sides.items()):
         raise ConfigError(f"{camera}: the camera stands inside a mesh of glass; move one of the two.")

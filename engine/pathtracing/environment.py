@@ -46,10 +46,12 @@ def build_environment_sampler(radiance_linear: Float32[np.ndarray, "h w 3"]) -> 
     height, width = radiance_linear.shape[:2]
     light = radiance_linear.astype(np.float64) @ _LUMINANCE
     light = (np.roll(light, 1, axis=1) + 2 * light + np.roll(light, -1, axis=1)) / 4
-    rows = np.pad(light, ((1, 1), (0, 0)), mode="edge")
+    rows = np.pad(light, ((1, 1), (0, 0)), mode="edge")  # rows do not wrap over the poles
     light = (rows[:-2] + 2 * rows[1:-1] + rows[2:]) / 4
+    # a row's solid angle shrinks towards the poles
     light *= np.sin((np.arange(height) + 0.5) / height * np.pi)[:, None]
     total = light.sum()
+    # a black map is sampled evenly
     shares = light / total if total > 0 else np.full((height, width), 1.0 / (height * width))
     of_rows = shares.sum(axis=1)
     within = np.cumsum(shares, axis=1) / np.where(of_rows > 0, of_rows, 1.0)[:, None]
@@ -61,6 +63,7 @@ def build_environment_sampler(radiance_linear: Float32[np.ndarray, "h w 3"]) -> 
 def mean_irradiance(radiance_linear: Float32[np.ndarray, "h w 3"]) -> Float64[np.ndarray, "3"]:
     """Return pi times the mean radiance: about the irradiance of a surface that faces the light."""
     height = len(radiance_linear)
+    # solid angles of rows: differences of the cosine of the polar angle
     edges = np.cos(np.arange(height + 1) / height * np.pi)
     bands = (edges[:-1] - edges[1:]) / 2
     return np.asarray(np.pi * (bands[:, None] * radiance_linear.mean(axis=1, dtype=np.float64)).sum(axis=0))

@@ -106,6 +106,7 @@ class Film:
                 values.reshape(len(values), -1), factors, each, pixels, sums.reshape(len(sums), -1)
             )
 
+        # a path either ends at a surface of Gaussians or goes on behind the layer
         front = (paths.flags & FLAG_GAUSSIAN_SURFACE != 0).astype(np.float32)
         through = paths.transmittance * (1 - front)
         add(self._layer, paths.layer_srgb)
@@ -118,7 +119,7 @@ class Film:
         if path_factors is not None:
             add(self._samples, path_factors)
             return
-        self._samples[pixels] += each
+        self._samples[pixels] += each  # without factors every path counts
         if self._has_guides:
             add(self._albedo, paths.albedo_linear)
             add(self._normals, paths.normals_world)
@@ -154,6 +155,7 @@ class Film:
             guides = (self._to_image(self._albedo / count), self._to_image(self._normals / count))
             light = denoise(self._to_image(self._light / count), *guides)
             smooth = light.reshape(-1, 3).astype(np.float64) * count
+            # the noise-free background behind no mesh stays
             film._light = np.where(self._mesh_visibility[:, None] > 0.0, smooth, self._light)
         covered = self._covered()
         shade = _safe_divide(self._shade, covered, 1.0)
@@ -174,7 +176,9 @@ class Film:
         surface = _safe_divide(self._front_light, self._front[:, None])
         if lit:
             shade = _safe_divide(self._shade, self._covered(), 1.0)
+            # linear light is scaled, display values would change hue
             color = srgb_to_linear(_safe_divide(layer, covered)) * np.maximum(shade, 0.0)
+            # an unlit color is not rounded twice
             layer = np.where(np.abs(shade - 1.0) < 1e-6, layer, covered * linear_to_srgb(color))
         display = layer + front * linear_to_srgb(surface) + through * linear_to_srgb(light)
         return np.asarray(srgb_to_linear(display))
@@ -186,11 +190,13 @@ class Film:
         if self._without_meshes is None or self.plate is None:
             return {}
         plain = self._without_meshes._linear_radiance(lit=False)
+        # where the plain image is dark the ratio would be noise: no shadow there
         is_lit = (self._without_meshes._samples > 0)[:, None] & (plain > _DARK)
         shadow = np.where(is_lit, self._without_meshes._linear_radiance() / np.where(is_lit, plain, 1.0), 1.0)
         background = self.plate._linear_radiance(lit=False)
         behind = background * shadow
         alpha = self._mesh_visibility / np.maximum(self._samples, 1)
+        # the least alpha for which picture - (1 - alpha) behind is not negative
         needed = np.where(behind > _DARK, 1.0 - picture / np.maximum(behind, _DARK), 0.0).max(axis=1)
         alpha = np.where(alpha > 0.0, np.clip(np.maximum(alpha, needed), 0.0, 1.0), 0.0)[:, None]
         mesh_light = np.where(alpha > 0.0, np.maximum(picture - (1.0 - alpha) * behind, 0.0), 0.0)

@@ -112,7 +112,7 @@ def build_gaussian_layers(
     tracer.build(merged, np.ascontiguousarray(np.concatenate(features)[:, :columns]))
 
     def caster(chosen: Bool[np.ndarray, " n"]) -> Tracer | None:
-        if chosen.all() or not chosen.any():
+        if chosen.all() or not chosen.any():  # all of them: the same hierarchy serves
             return tracer if chosen.any() else None
         some = make_tracer(settings, threads=threads, build_quality=2)
         some.build(merged.select(chosen))
@@ -140,6 +140,7 @@ def default_shadow_bias(gaussians: FlatGaussians, size: float) -> float:
     if len(gaussians) == 0:
         return SHADOW_BIAS_FRACTION * size
     deviations = np.sqrt(gaussians.scales.prod(axis=1))
+    # half of the visible area belongs to Gaussians that are no larger
     area = np.cumsum((gaussians.opacities * deviations**2)[order := np.argsort(deviations)])
     typical = float(deviations[order][min(np.searchsorted(area, area[-1] / 2), len(order) - 1)])
     return max(SHADOW_BIAS_FRACTION * size, SHADOW_BIAS_DEVIATIONS * typical)
@@ -180,5 +181,5 @@ def _material_features(gaussians: FlatGaussians, scene: StageGaussians) -> Float
 def _without_color(gaussians: FlatGaussians) -> FlatGaussians:
     """Return the Gaussians with zero radiance of their own."""
     sh = np.zeros((len(gaussians), 1, 3), np.float32)
-    sh[:, 0] = -1.0 / SH_C0
+    sh[:, 0] = -1.0 / SH_C0  # color 1/2 + C0 sh = 0
     return replace(gaussians, sh=sh)

@@ -54,6 +54,7 @@ def import_material(
         if not is_closed():
             left_out.append("the refraction of glass that is not closed")
             ior = THIN_IOR
+        # per unit of the file to per world unit
         red, green, blue = (value / scale for value in source.absorption)
         material = Glass(
             ior=ior,
@@ -72,9 +73,11 @@ def import_material(
             "emission_texture": source.emission_texture,
         }
         strength = max(source.emission_linear)
+        # an image alone sends no light: it is a factor
         if strength == 0.0:
             fields["emission_texture"] = None
         images = {name: image for name, image in fields.items() if image is not None}
+        # split into a strength and a color whose largest channel is 1
         red, green, blue = (value / strength if strength else 1.0 for value in source.emission_linear)
         material = MetallicRoughness(
             color_srgb=_to_srgb(source.rgb_linear),

@@ -72,6 +72,7 @@ def _mesh_tables(meshes: Sequence[EmissiveMesh]) -> _MeshTables:
         sums.append(np.concatenate([[0.0], np.cumsum(own) / own.sum()]))
         corners.append(mesh.corners_world)
         uv.append(mesh.corner_uv)
+        # a mesh's sums have one row more than it has triangles
         face, row = face + len(own), row + len(own) + 1
     return _MeshTables(rows, np.concatenate(sums), np.concatenate(corners), np.concatenate(uv))
 
@@ -114,6 +115,7 @@ def build_light_arrays(
                 cosines[l] = np.cos(np.radians([light.outer_degrees, light.inner_degrees]))
             elif light.radius > 0.0:
                 areas[l] = np.pi * light.radius**2
+                # intensity = radiance times the disc's area
                 kinds[l], rgb[l], visibility[l] = SPHERE, rgb[l] / areas[l], light.visible
         elif isinstance(light, DirectionalLight):
             kinds[l], rgb[l] = DIRECTIONAL, color * light.irradiance
@@ -124,9 +126,10 @@ def build_light_arrays(
     for l, mesh in enumerate(meshes, len(lights)):
         own = triangle_areas(mesh.corners_world)
         kinds[l], rgb[l], areas[l], visibility[l], adds[l] = MESH, mesh.rgb_linear, own.sum(), 1, 1
+        # mean of the surface, for estimates of its distance
         positions[l] = own @ mesh.corners_world.mean(axis=1, dtype=np.float64) / own.sum()
         textures[l], rows[l] = mesh.texture, tables.rows[l - len(lights)]
-    radiance, frame = np.zeros((1, 1, 3), np.float32), np.eye(3)
+    radiance, frame = np.zeros((1, 1, 3), np.float32), np.eye(3)  # the kernels need a map: one black pixel
     if environment is not None:
         radiance, frame = environment.radiance_linear, environment.frame
         kinds[-1], rgb[-1], visibility[-1] = ENVIRONMENT, mean_irradiance(radiance), 1

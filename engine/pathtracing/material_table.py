@@ -62,6 +62,7 @@ class MaterialTable:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._rows: list[dict[str, object]] = []
+        # the default, which Gaussians with materials read too
         self._albedo_tables: list[tuple[str, float]] = [("coat", 1.5)]
         self._textures: dict[tuple[FileImage, TextureUse], int] = {}
         self._images: list[Float32[np.ndarray, "h w 3"]] = []
@@ -103,11 +104,12 @@ class MaterialTable:
             row |= {"roughness": material.roughness, "energy_compensation": material.multiple_scattering}
             if material.roughness > 0.0 and material.ior > 1.0:
                 row["coat_tables"] = self._albedo_table_id("rough_dielectric", material.ior)
+                # of leaving, in the place behind that of entering
                 self._albedo_table_id("rough_dielectric", 1.0 / material.ior)
         else:
             color = material.color_srgb
             row["kinds"] = {Diffuse: DIFFUSE, Mirror: MIRROR}.get(type(material), PRINCIPLED)
-        row["colors_linear"] = srgb_to_linear(np.array(color))
+        row["colors_linear"] = srgb_to_linear(np.array(color))  # tables and materials are linear
         if isinstance(material, Metal | Dielectric | MetallicRoughness):
             row["roughness"] = material.roughness
         if isinstance(material, Metal):
@@ -190,7 +192,7 @@ class MaterialTable:
             if not np.isfinite(rgb).all():
                 raise ConfigError(f"{label}: {image.name} holds values that are not finite; mend the image.")
             self._textures[image, use] = len(self._images)
-            most = None if use == "light" else 1.0
+            most = None if use == "light" else 1.0  # reflectances are at most 1, light is not limited
             self._images.append(np.ascontiguousarray(np.clip(rgb, 0.0, most), np.float32))
             if sum(i.shape[0] * i.shape[1] for i in self._images) > MAX_TEXELS:
                 raise ConfigError(

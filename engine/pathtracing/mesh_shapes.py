@@ -124,6 +124,7 @@ def transform_normals(
     normals: Float64[np.ndarray, "n 3"], placement: Transformed, rotation: Float64[np.ndarray, "3 3"]
 ) -> Float32[np.ndarray, "n 3"]:
     """Return unit normals of points transformed by :func:`transform_points`; NaN for those of no length."""
+    # normals scale by the inverse
     turned = normals / np.array(placement.scale) @ (rotation_matrix(placement.rotation_degrees) @ rotation).T
     lengths = np.linalg.norm(turned, axis=1, keepdims=True)
     return np.asarray((turned / np.where(lengths > 1e-12, lengths, np.nan)).astype(np.float32))
@@ -142,6 +143,7 @@ def corner_normals(
     counts = np.bincount(owner.reshape(-1))
     starts = np.concatenate([[0], np.cumsum(counts)])
     normals = np.empty(corners_world.shape, np.float32)
+    # below any cosine: all faces at a point
     least = -2.0 if smooth_degrees >= 180 else np.cos(np.radians(smooth_degrees)) - 1e-9
     smooth_normals(corners_world.astype(np.float64), order, starts, least, normals)
     return normals
@@ -157,6 +159,7 @@ def count_open_edges(shape: MeshShape, face_mask: Bool[np.ndarray, " f"] | None 
         np.round(shape.vertices / (WELD_TOLERANCE * size)).astype(np.int64), axis=0, return_inverse=True
     )
     faces = owner.reshape(-1)[shape.faces if face_mask is None else shape.faces[face_mask]].astype(np.int32)
+    # faces welded to a line have edges of their own, which are no holes
     sound = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     report = edge_report(faces[sound])
     return report.open_edges + report.non_manifold_edges + report.inconsistent_edges
@@ -171,6 +174,7 @@ def turn_outwards(shape: MeshShape, face_mask: Bool[np.ndarray, " f"]) -> MeshSh
             they face inwards.
     """
     faces = shape.faces[face_mask]
+    # far from the origin the sum of volumes would lose its digits
     points = shape.vertices - shape.vertices.mean(axis=0)
     a, b, c = points[faces[:, 0]], points[faces[:, 1]], points[faces[:, 2]]
     if np.einsum("fk,fk->", a, np.cross(b, c)) >= 0:
@@ -187,7 +191,7 @@ def turn_outwards(shape: MeshShape, face_mask: Bool[np.ndarray, " f"]) -> MeshSh
     if normals is not None:
         outwards = np.cross(c - a, b - a)
         agreement = np.nansum(normals[faces] * outwards[:, None], axis=(1, 2)).sum()
-        if agreement < 0:
+        if agreement < 0:  # normals may face outwards already, whatever the winding
             normals = normals.copy()
             own = np.unique(faces)
             normals[own] = -normals[own]

@@ -83,6 +83,7 @@ class Workspace:
 def optical_axis(directions_world: Float32[np.ndarray, "h w 3"]) -> Float64[np.ndarray, "3"]:
     """Return the direction through the image's centre."""
     height, width = directions_world.shape[:2]
+    # the middle pixel, or the two or four around it
     middle = directions_world[(height - 1) // 2 : height // 2 + 1, (width - 1) // 2 : width // 2 + 1]
     axis = middle.reshape(-1, 3).mean(axis=0, dtype=np.float64)
     return np.asarray(axis / np.linalg.norm(axis))

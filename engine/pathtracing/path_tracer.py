@@ -113,6 +113,7 @@ class PathTracer:
         self._denoise = load_denoiser() if settings.denoise else None
         self._plate: PathTracer | None = None
         if settings.layers:
+            # a plate has no plate itself
             plain = settings.model_copy(update={"layers": False, "denoise": False})
             empty = scene.environment_only or compile_meshes(Stage(), Path(), threads=threads)
             alone = PathTracerScene(empty, scene.layers, scene.background_linear)
@@ -173,6 +174,7 @@ class PathTracer:
             self._settings.aperture,
             self._settings.focus_distance or 1.0,
         )
+        # neighboring pixels together: their rays form packets
         order = tile_order(image.height_px, image.width_px)
         together = PATHS_PER_THREAD if self._scene.layers is None else PATHS_PER_WAVE
         # Always the same cut, as what is traced together may differ in the last digit.
@@ -215,7 +217,7 @@ class PathTracer:
         tasks = [self._pool.submit(work, batch) for batch in image.batches]
         try:
             for task in tasks:
-                yield
+                yield  # callers report progress, or stop, before each wait
                 task.result()
         finally:
             for task in tasks:
@@ -256,6 +258,7 @@ class PathTracer:
         )  # fmt: skip
         every = np.arange(count, dtype=np.int32)
         self._add_surface_light(paths, every, shadows, None if layers is None else layers.tracer)
+        # depth 0, the camera's ray, is replaced by the given points
         self._trace_paths(paths, np.zeros(1, np.float32), every[paths.is_alive], first_depth=1)
         return paths.radiance_linear
 
@@ -302,6 +305,7 @@ class PathTracer:
                     features=traced.features,
                     min_transmittance=layers.min_transmittance,
                 )
+                # surfaces first: what of the layer has a material is taken out of it
                 if layers.has_material_surfaces:
                     self._run_kernel(intersect_gaussian_surfaces, len(active), bounce, layer)
                     self._add_surface_light(paths, active, shadows, layers.tracer)
@@ -311,6 +315,7 @@ class PathTracer:
             self._add_surface_light(
                 paths, active, shadows, None if layers is None else layers.mesh_shadow_tracer
             )
+            # wavefronts shrink, so that later bounces trace only what is left
             active = active[paths.is_alive[active]]
             if len(active) == 0:
                 return
@@ -339,7 +344,7 @@ class PathTracer:
         casters: Tracer | None,
     ) -> None:
         """Add the light that reaches surfaces past meshes and the Gaussians of ``casters``."""
-        shadows.occluded_radiance_linear[:] = 0.0
+        shadows.occluded_radiance_linear[:] = 0.0  # the layers of this bounce wrote to the same rows
         share = self._shadow_transmittance(shadows)
         free = np.flatnonzero(share.any(axis=1))
         if casters is not None and len(free):
@@ -376,6 +381,7 @@ class PathTracer:
 
     def _run_kernel(self, kernel: Callable[..., None], rows: int, *arguments: object) -> None:
         """Run a kernel over rows on all threads. Numba's own loops cannot write to named tuples."""
+        # few rows are not worth a second thread
         parts = max(1, min(self._threads, rows // MIN_ROWS_PER_THREAD))
         cuts = [rows * part // parts for part in range(parts + 1)]
         work = zip(pairwise(cuts), self._scratches, strict=False)

@@ -54,4 +54,5 @@ def _placed_about(part: PlacedT, key: str, origin: Origin, moved: list[str]) -> 
 
 def _is_far(place: tuple[float, float, float], origin: Origin) -> bool:
     offset = np.array(place) - np.array(origin)
+    # nearer to the origin than to zero: it is whole
     return bool(np.linalg.norm(offset) < np.linalg.norm(place) / 2)

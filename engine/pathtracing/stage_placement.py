@@ -63,7 +63,7 @@ def place_resting_meshes(
         ) - np.array(mesh.position)
         heights = points @ up
         middle = (points.min(axis=0) + points.max(axis=0)) / 2
-        foot = middle - (middle @ up - heights.min()) * up
+        foot = middle - (middle @ up - heights.min()) * up  # the lowest point under the middle
         position = spot - foot + np.array(mesh.position)
         meshes[number] = mesh.model_copy(update={"position": tuple(float(x) for x in position), "on": None})
     return stage.model_copy(update={"meshes": tuple(meshes)})
@@ -111,6 +111,7 @@ def estimate_stage_layout(
         return _stage_layout(up, centre_world, size, -up)
     normals = some.rotations[:, :, 0].astype(np.float64)
     towards = cameras_world.mean(axis=0) - some.means_world
+    # either side is outside: that which faces the cameras counts
     normals *= np.where((normals * towards).sum(axis=1) < 0, -1.0, 1.0)[:, None]
     area = (some.opacities * np.exp(some.log_scales.sum(axis=1))).astype(np.float64)
     spots, standing = _find_floor(some.means_world.astype(np.float64), normals @ up, area, up, size)
@@ -126,12 +127,14 @@ def estimate_stage_layout(
     heights, cosines = some.means_world.astype(np.float64) @ up, normals @ up
     height = float(spots[0] @ up)
     if level_fraction(heights, cosines, area, height, size) >= MIN_LEVEL_FRACTION:
+        # the thing's own level surface is no floor if much of it lies lower
         if not (_stands_alone(gaussians, near) and _is_within(heights, cosines, area, height, size)):
             return _stage_layout(up, floor, size, light)
         spots = _spots_beside(some.means_world.astype(np.float64), area, up, size)
         ways = [RayBatch.between(camera[None], spots + 0.05 * size * up) for camera in cameras_world]
         transmittance = np.mean([tracer.transmittance(way) for way in ways], axis=0)
         nearness = (spots - centre_world) @ (cameras_world.mean(axis=0) - centre_world)
+        # equally visible spots: the one towards the cameras
         best = np.lexsort((nearness, np.round(transmittance, 2)))[-1]
         return replace(_stage_layout(up, spots[best], size, light), is_beside=True)
     places = centre_world + np.array(HANGING_FRACTIONS)[:, None] * (cameras_world.mean(axis=0) - centre_world)
@@ -209,6 +212,7 @@ def _find_floor(
         level = np.ones(len(points), bool)
     bins = np.linspace(heights.min(), heights.max() + 1e-9, 65)
     counts = np.histogram(heights[level], bins, weights=area[level])[0]
+    # smoothed over neighboring bins, as a floor may straddle two
     peak = int(np.argmax(np.convolve(counts, [0.5, 1.0, 0.5], mode="same")))
     height = (bins[peak] + bins[peak + 1]) / 2
     on_floor = np.flatnonzero(level & (np.abs(heights - height) < 0.05 * size))
@@ -228,7 +232,7 @@ def _estimate_light_direction(
     """Return the mean normal of bright surfaces, at least 30 degrees above the horizon."""
     bright = rgb_srgb.astype(np.float64).mean(axis=1)
     matrix = np.concatenate([np.ones((len(bright), 1)), normals], axis=1)
-    weights = np.sqrt(np.minimum(area, np.quantile(area, 0.95)))
+    weights = np.sqrt(np.minimum(area, np.quantile(area, 0.95)))  # large Gaussians must not decide alone
     towards = np.linalg.lstsq(matrix * weights[:, None], bright * weights, rcond=None)[0][1:]
     level = towards - (towards @ up) * up
     height = max(towards @ up, 0.6 * float(np.linalg.norm(level)), 1e-9)

@@ -79,6 +79,7 @@ class StageScene:
         inside = (at >= 0).all() and at[0] <= view.width_px and at[1] <= view.height_px
         if not (inside and np.isfinite(direction).all()):
             raise ConfigError(f"{name}: has no pixel {pixel[0]:g}, {pixel[1]:g}.")
+        # rotation_cam_from_world maps world to camera: from the right it is the inverse
         return view.origin_world, direction @ view.rotation_cam_from_world
 
 

@@ -30,6 +30,6 @@ def adam_update(
 def smoothness_gradient(values: Float[np.ndarray, "h w 3"]) -> Float64[np.ndarray, "h w 3"]:
     """Return four times each texel less the four beside it: the gradient of half the squared differences."""
     x = values.astype(np.float64)
-    padded = np.pad(x, ((1, 1), (0, 0), (0, 0)), mode="edge")
+    padded = np.pad(x, ((1, 1), (0, 0), (0, 0)), mode="edge")  # no wrap over the poles; columns go around
     neighbor_sum = np.roll(x, 1, axis=1) + np.roll(x, -1, axis=1) + padded[:-2] + padded[2:]
     return np.asarray(4 * x - neighbor_sum)

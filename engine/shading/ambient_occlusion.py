@@ -50,6 +50,7 @@ def ambient_visibility(
     for part in _ray_chunks(len(ids), rays):
         for number, side in enumerate(sides):
             hemisphere = _hemisphere_rays(gaussians, ids[part], np.full(len(ids[part]), side), rays, offset)
+            # the mean over cosine-distributed rays is cosine-weighted
             visibility[number, part] = tracer.transmittance(hemisphere).reshape(-1, rays).mean(axis=1)
     return visibility.max(axis=0), np.array(sides, np.float32)[visibility.argmax(axis=0)]
 
@@ -94,6 +95,7 @@ def _hemisphere_rays(
 ) -> RayBatch:
     """Return rays over the hemisphere of one side of each Gaussian, begun a little above it."""
     frames = rotation_matrices(gaussians.quats_wxyz[ids])
+    # the other side: its normal reversed, the axes in its plane kept
     frames = frames * np.stack([side, np.ones_like(side), np.ones_like(side)], axis=1)[:, None, :]
     directions = np.einsum("nij,kj->nki", frames, cosine_hemisphere(rays))
     starts = np.repeat(gaussians.means_world[ids] + offset.bias_world * frames[:, :, 0], rays, axis=0)
@@ -103,6 +105,7 @@ def _hemisphere_rays(
 
 def cosine_hemisphere(rays: int) -> Float64[np.ndarray, "k 3"]:
     """Return directions about the first axis with a density of the cosine to it; the same each time."""
+    # a Fibonacci spiral over the disc, lifted to the hemisphere: cosine-weighted
     square = (np.arange(rays) + 0.5) / rays
     angle = _GOLDEN_ANGLE * np.arange(rays)
     radius = np.sqrt(square)

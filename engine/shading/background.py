@@ -104,6 +104,7 @@ class LearnedBackground(WrapperModel):
         """Return gradients by what the inner model shaded and by the map's colors along the rays."""
         assert isinstance(shaded.ctx, tuple)
         inner, background_srgb = shaded.ctx
+        # rgb = inner + T background
         grad_transmittance = (grad.rgb_srgb * background_srgb).sum(axis=1, dtype=np.float32)
         inner_grad = ShadedRayGradients(grad.rgb_srgb, grad_transmittance)
         below = self.inner.backward(traced, inner, inner_grad)
@@ -131,6 +132,7 @@ class LearnedBackground(WrapperModel):
         self.steps += 1
         if self.steps[0] % STEP_INTERVAL:
             return
+        # texels shrink towards the poles; so does their share of the prior
         shares = solid_angles(len(self.sums))[:, None, None] / (4 * np.pi)
         gradient = self.sums / STEP_INTERVAL + self._smoothness_weight * shares * smoothness_gradient(
             self.rgb_srgb

@@ -91,7 +91,7 @@ class DeferredShading:
             self._ray_bias_world, settings.backface_cull_distance * extent_world
         )
         self._hemisphere_offset = self._reflection_offset._replace(bias_world=2 * self._ray_bias_world)
-        self._occlusion_turn = np.array([-1.0, -1.0])
+        self._occlusion_turn = np.array([-1.0, -1.0])  # no turn yet: no progress is negative
         self._features: Float32[np.ndarray, "n f"] = np.empty((0, 5), np.float32)
 
     # --- what a recipe says of the training around it ---
@@ -195,6 +195,7 @@ class DeferredShading:
         gbuffer = build_gbuffer(rays, result)
         surface = self._surface_with_ambient(result, gbuffer)
         no_bounces = np.zeros((len(gbuffer.ray_ids), 3))
+        # the environment through the mean visibility, no reflected rays
         surface = replace(surface, visibility=surface.ambient, bounced_linear=no_bounces)
         radiance = np.zeros((len(rays), 3))
         radiance[gbuffer.ray_ids] = gbuffer.alpha[:, None] * shade(surface, self.light.levels, self.frame)
@@ -225,6 +226,7 @@ class DeferredShading:
         )
         rgb = self._unshaded_part(traced, context)
         rgb[gbuffer.ray_ids] += (ramp * gbuffer.alpha[:, None] * display).astype(np.float32)
+        # only finished pictures have layers
         layers = {} if traced.view is not None else context.named_layers(self._layer_radiance(context, rgb))
         return ShadedRays(split.sum_layers(rgb), result.transmittance, context, layers)
 
@@ -236,6 +238,7 @@ class DeferredShading:
         split, gbuffer, incident = ctx.depth_layers, ctx.gbuffer, ctx.incident
         grad_rgb = grad.rgb_srgb
         # --- regularisers of the rays' geometry and materials ---
+        # dL/dT is -dL/dalpha
         grad_alpha = -grad.transmittance.astype(np.float64)
         grad_normal = np.zeros((len(grad_rgb), 3))
         grad_features = np.zeros((len(grad_rgb), split.results.features.shape[1]))
@@ -245,7 +248,7 @@ class DeferredShading:
         grad_features, grad_depth = split.expand(grad_features), split.expand(grad_depth)
         # --- the split sum at the shaded points ---
         grad_display = split.expand(grad_rgb)[gbuffer.ray_ids] * ctx.ramp
-        grad_alpha[gbuffer.ray_ids] += (grad_display * ctx.display).sum(axis=1)
+        grad_alpha[gbuffer.ray_ids] += (grad_display * ctx.display).sum(axis=1)  # rgb = ramp alpha display
         grad_linear = self._display_backward(ctx.linear, grad_display * gbuffer.alpha[:, None])
         blur = settings.blur_roughness(traced.training_progress)
         back = shade_backward(ctx.surface, self.light.levels, self.frame, grad_linear, blur=blur)
@@ -278,7 +281,7 @@ class DeferredShading:
             self._features[ids, first : first + width] = update.gaussians.channels[name][ids]
             first += width
         if "materials.texels" in update.parameters:
-            rate = ENVIRONMENT_RATE * 0.1**update.training_progress
+            rate = ENVIRONMENT_RATE * 0.1**update.training_progress  # falls to a tenth by the end
             self.light.step(update.parameters["materials.texels"], rate=rate)
 
     def state(self) -> dict[str, np.ndarray]:

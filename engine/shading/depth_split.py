@@ -82,6 +82,7 @@ class DepthLayers:
             if value is not None:
                 of_rays[name] = value[:count]
                 of_fronts[name] = np.zeros((len(self.traced), *value.shape[1:]), value.dtype)
+                # the whole ray is the back: what the front has is subtracted there
                 of_fronts[name][self.traced] = value[count:] - value[self.split_ids]
         fronts = () if self.front is None else ((self.front, TraceGradients(**of_fronts)),)
         return TraceGradients(**of_rays), fronts
@@ -114,6 +115,7 @@ def split_by_depth(
     split_ids = np.flatnonzero(far)
     if not len(split_ids):
         return single_layer(rays, result)
+    # not beyond the ray's own end
     ends = np.minimum(np.broadcast_to(rays.t_max, len(rays))[split_ids], mean[split_ids])
     front_rays = rays[split_ids].with_t_max(ends)
     front = tracer.trace(front_rays, record=record_for_backward)

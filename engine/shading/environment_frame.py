@@ -13,6 +13,7 @@ def environment_frame(
     rotation turns it to the left, seen from above anticlockwise.
     """
     up = up_world / np.linalg.norm(up_world)
+    # up must not be parallel to it
     ahead = np.array([1.0, 0.0, 0.0]) if abs(up[2]) > 0.9 else np.array([0.0, 0.0, 1.0])
     ahead = ahead - (ahead @ up) * up
     ahead /= np.linalg.norm(ahead)

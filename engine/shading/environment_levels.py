@@ -65,6 +65,7 @@ class EnvironmentPrefilter:
         self._maps: list[_SparseRows] = []
         for level in range(1, len(_HALVINGS)):
             alpha = ROUGHNESSES[level] ** 2 if level < len(ROUGHNESSES) else -1.0
+            # blurrier levels are made from coarser maps: fewer texels a lobe
             source = height >> _SOURCES[level]
             self._maps.append(_lobe_matrix(int(self.heights[level]), source, alpha, _LEAST[level]))
 
@@ -89,7 +90,7 @@ class EnvironmentPrefilter:
         """Return gradients by the environment's texels from those by the texels of all its levels."""
         sizes = [2 * (self.height >> halving) ** 2 for halving in range(max(_SOURCES) + 1)]
         sums = [np.zeros((size, 3)) for size in sizes]
-        sums[0] += grad_texels[: self.offsets[1]]
+        sums[0] += grad_texels[: self.offsets[1]]  # the first level is the map itself
         for level, transposed in enumerate(self._transposed_filters, start=1):
             part = np.empty_like(sums[_SOURCES[level]])
             transposed.multiply(grad_texels[self.offsets[level] : self.offsets[level + 1]], part)
@@ -158,6 +159,7 @@ def _lobe_matrix(height: int, source: int, alpha: float, least: float) -> _Spars
     starts = np.empty(2 * height * height + 1, np.int64)
     nothing = np.empty(0, np.int32), np.empty(0, np.float32)
     lobe = (height, source, alpha, least, starts)
+    # first only counted, so that the arrays have the right size
     run_ranges(lobe_rows, threads_in_use(), len(starts) - 1, *lobe, *nothing, True)
     starts[0] = 0
     np.cumsum(starts, out=starts)

@@ -66,6 +66,7 @@ class EnvironmentLight:
     def set_radiance(self, radiance_linear: Float32[np.ndarray, "h w 3"]) -> None:
         """Take another environment instead, of any size."""
         radiance = resample_environment(radiance_linear, self._prefilter.height)
+        # the logarithm of black is cut off
         self.log_radiance = np.log(np.maximum(radiance, np.exp(_DARKEST))).astype(np.float32)
         self._levels = None
 
@@ -82,6 +83,7 @@ class EnvironmentLight:
         self.steps += 1
         if self.steps[0] % ENVIRONMENT_EVERY:
             return
+        # d radiance / d log radiance = radiance
         gradient = self._prefilter.backward(self.sums) * self.radiance_linear + self._prior_gradients()
         self.sums[:] = 0
         count = self.steps[0] // ENVIRONMENT_EVERY

@@ -80,6 +80,7 @@ class ExposureModel(WrapperModel):
         if view is None:
             return inner
         gains, offsets = np.exp(self.log_gains)[view], self.offsets[view]
+        # offsets belong to what is covered: the background is not exposed
         alpha = np.float32(1) - inner.transmittance
         rgb = gains * inner.rgb_srgb + offsets * alpha[:, None]
         return ShadedRays(rgb, inner.transmittance, inner, inner.layers)
@@ -142,6 +143,7 @@ class ExposureModel(WrapperModel):
         used, sums = update.parameters["exposure.views"], update.parameters["exposure.sums"]
         self.steps[used] += 1
         steps = self.steps[used, None]
+        # one row and step count a view: only the views of the batch move
         self.first[used] = BETA1 * self.first[used] + (1 - BETA1) * sums
         self.second[used] = BETA2 * self.second[used] + (1 - BETA2) * sums**2
         mean = self.first[used] / (1 - BETA1**steps)
@@ -150,6 +152,7 @@ class ExposureModel(WrapperModel):
         self.log_gains[used] -= change[:, :3]
         self.offsets[used] -= change[:, 3:]
         is_trained = self.steps > 0
+        # the scene's brightness and a common exposure cannot be told apart
         for values in (self.log_gains, self.offsets):
             values[is_trained] -= values[is_trained].mean(axis=0, dtype=np.float64).astype(np.float32)
 

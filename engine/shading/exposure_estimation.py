@@ -56,6 +56,7 @@ def estimate_values(
         return _neighbor_mean(known, ours, theirs)[0]
     views = _Views(known, ours, theirs, brightness[trained], brightness[others])
     ways = [_line_then_neighbors(views), _neighbors_then_line(views)]
+    # by the inverse of the mean squared error when left out
     shares = np.array([1 / (np.square(left).mean() + 1e-12) for _, left in ways])
     shares /= shares.sum()
     return shares[0] * ways[0][0] + shares[1] * ways[1][0]
@@ -112,6 +113,7 @@ def _fit_slopes(
     fitted = brightness[:, None] * slopes
     if height is not None:
         fitted, leverage = fitted + height, leverage + 1 / len(brightness)
+    # leave-one-out residual: residual / (1 - leverage)
     left_out = known - (known - fitted) / np.maximum(1 - leverage[:, None], 1e-6)
     return slopes, left_out, _shrinkage_factor(left_out, known)
 

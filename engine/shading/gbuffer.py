@@ -72,6 +72,7 @@ def backward_gbuffer(
     """Add gradients by a buffer's materials and unit normals to those by what was blended."""
     ray_ids, surface = gbuffer.ray_ids, gbuffer.surface
     grad_features[ray_ids, :5] += grad_material / gbuffer.alpha[:, None]
+    # material = features / alpha, so that alpha has the opposite gradient
     grad_alpha[ray_ids] -= (grad_material * surface.material).sum(axis=1) / gbuffer.alpha
     grad_normal[ray_ids] += gbuffer.facing_normals.backward(grad_unit_normal, surface.direction_world)
 
@@ -97,8 +98,9 @@ def reflected_rays(
     gap_world = offset.bias_world
     points = origins + gbuffer.depth[:, None] * directions + gap_world * normals
     facets = normals if facets_world is None else facets_world
-    mirrored = directions - 2 * (directions * facets).sum(axis=1, keepdims=True) * facets
+    mirrored = directions - 2 * (directions * facets).sum(axis=1, keepdims=True) * facets  # d - 2 <d, n> n
     rise = (mirrored * normals).sum(axis=1, keepdims=True)
+    # a facet may mirror below the surface: along it then
     mirrored += np.maximum(MIN_COSINE - rise, 0.0) * normals
     mirrored /= np.linalg.norm(mirrored, axis=1, keepdims=True)
     return RayBatch(

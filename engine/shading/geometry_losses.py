@@ -82,6 +82,7 @@ def add_depth_normal_gradient(
     cross = np.cross(a, b)
     length = np.maximum(np.linalg.norm(cross, axis=-1, keepdims=True), 1e-12)
     towards = -patches.grid(directions)[:, :-1, :-1]
+    # turned to the viewer, as blended normals are
     sign = np.where((cross * towards).sum(axis=-1, keepdims=True) < 0, -1.0, 1.0)
     spanned = sign * cross / length
     sums = patches.grid(result.normal_world[ray_ids].astype(np.float64))[:, :-1, :-1]
@@ -90,9 +91,11 @@ def add_depth_normal_gradient(
     opaque = patches.grid(alpha) > MIN_ALPHA
     counted = opaque[:, :-1, :-1] & opaque[:, :-1, 1:] & opaque[:, 1:, :-1]
     counted &= (spanned * towards).sum(axis=-1) > MIN_VIEW_COSINE
+    # a mean over all rays, counted or not
     share = np.where(counted, weight / len(result.transmittance), 0.0)[..., None]
     cosine = (spanned * normal).sum(axis=-1, keepdims=True)
     grad_sums = -share * (spanned - cosine * normal) / normal_length
+    # d of a unit vector: perpendicular to it, over its length
     grad_cross = -share * sign * (normal - cosine * spanned) / length
     grad_a, grad_b = np.cross(b, grad_cross), np.cross(grad_cross, a)
     grad_points = np.zeros_like(points)
@@ -125,6 +128,7 @@ def add_normal_smoothness_gradient(
     gradient = np.zeros_like(normal)
     for one, other in _NEIGHBOR_SLICES:
         cosine = (normal[one] * normal[other]).sum(axis=-1, keepdims=True)
+        # across an edge normals may differ
         counted = (opaque[one] & opaque[other])[..., None] & (cosine > MIN_NORMAL_COSINE)
         share = np.where(counted, weight / len(traced.result.transmittance), 0.0)
         gradient[one] -= share * (normal[other] - cosine * normal[one])
@@ -158,6 +162,7 @@ def add_material_smoothness_gradient(
     share = np.array(weights) / len(traced.result.transmittance)
     for one, other in _NEIGHBOR_SLICES:
         difference = material[one] - material[other]
+        # sqrt(x^2 + delta^2), derived: Huber-like
         slope = difference / np.sqrt(difference**2 + HUBER_DELTA**2)
         slope = _zero_outside(opaque[one] & opaque[other], slope) * share
         both = np.clip(np.minimum(material[one][..., 3:4], material[other][..., 3:4]), 0, 1)

@@ -90,6 +90,7 @@ class RayPairIncidentLight:
             settings.min_facet_slope(traced.training_progress),
         )
         if traced.dither is None:
+            # other numbers at each iteration, the same after a resume
             uniforms = direction_uniforms(directions, salt)
         else:
             uniforms = split.expand(traced.dither.T)[gbuffer.ray_ids].T
@@ -98,6 +99,7 @@ class RayPairIncidentLight:
         )
         probe = None
         if record and settings.roughness_probe_fraction > 0:
+            # salt + 1: independent of the facets' numbers
             is_probed = direction_uniforms(directions, salt + 1)[0] < settings.roughness_probe_fraction
             probe = probe_roughness(rays, gbuffer, reflection_tracer, pairs, is_probed, min_slope=min_slope)
         return cls(pairs, probe, gbuffer.surface.material[:, 4], reflection_tracer, settings)
@@ -117,6 +119,7 @@ class RayPairIncidentLight:
             return
         ids = probe.point_ids
         slope = backward_roughness(probe, self.roughness[ids], back.around[ids], back.specular[ids])
+        # unbiased: each point is drawn with this probability
         back.material[ids, 4] += slope / self.settings.roughness_probe_fraction
 
     def backward(self, back: ShadeGradients, grad_texels: Float64[np.ndarray, "t 3"]) -> RecordedGradients:

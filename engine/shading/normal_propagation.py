@@ -36,6 +36,7 @@ def propagate_normals(gaussians: FlatGaussians) -> None:
     frames = gaussians.rotations.astype(np.float64)
     normals = frames[:, :, 0]
     distances, near = cKDTree(means).query(means, NEIGHBOURS + 1)
+    # typical distance to the nearest neighbors
     spacing = np.maximum(distances[:, NEIGHBOURS // 2], 1e-12)[:, None]
     reflectivity = gaussians.channels[METALLIC][:, 0] * (1 - gaussians.channels[ROUGHNESS][:, 0])
     trust = gaussians.opacities * (MIN_TRUST + reflectivity)
@@ -49,6 +50,7 @@ def propagate_normals(gaussians: FlatGaussians) -> None:
     )
     unlike = ((appearance[near] - appearance[:, None]) ** 2).sum(axis=2)
     weights = trust[near] * np.exp(-0.5 * ((distances / spacing) ** 2 + plane_distance**2 + unlike))
+    # sign: opposite normals are the same plane
     weights = np.where(np.abs(cosine) > MIN_COSINE, weights, 0.0) * np.sign(cosine)
     mean = np.einsum("nk,nki->ni", weights, normals[near])
     length = np.linalg.norm(mean, axis=1, keepdims=True)
@@ -66,4 +68,5 @@ def _rotations_between(
     cross = np.zeros((len(before), 3, 3))
     cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = -axis[:, 2], axis[:, 1], -axis[:, 0]
     cross -= cross.transpose(0, 2, 1)
+    # Rodrigues' formula without the angle
     return np.eye(3) + cross + (cross @ cross) / (1 + cosine)[:, None, None]

@@ -94,7 +94,7 @@ class RefGaussianShading(DeferredShading):
         """Step as the other model, but start materials and environment over when deferred shading begins."""
         if is_deferred(update.training_progress) and not self._has_restarted[0]:
             self._reset_materials(update.gaussians)
-            return
+            return  # gradients of the former materials are of no use
         super().step(update)
 
     def _reset_materials(self, gaussians: FlatGaussians) -> None:
@@ -126,6 +126,7 @@ class RefGaussianShading(DeferredShading):
         """Trace one mirrored ray a point, which hits harmonics in display values or nothing."""
         rays = reflected_rays(split.rays, gbuffer, self._reflection_offset)
         result = traced.tracer.trace(rays.with_t_max(RAY_LENGTH), record=traced.view is not None)
+        # yes or no, as the published code traces a mesh
         visibility = (result.transmittance > HIDDEN_TRANSMITTANCE).astype(np.float64)
         if self.settings.indirect == "none":
             return SingleRayIncidentLight(IncidentLight(visibility, np.zeros((len(rays), 3))))

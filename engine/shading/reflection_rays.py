@@ -51,7 +51,8 @@ def sample_facets(
     """Draw facets by GGX's distribution, at least ``min_slope`` steep, from two uniform numbers each."""
     u, v = numbers
     alpha = surface.material[:, 4] ** 2
-    u = u * MAX_FACET_SLOPE
+    u = u * MAX_FACET_SLOPE  # the steepest facets, which GGX has without bound, are left out
+    # tan of GGX's facets: alpha sqrt(u / (1 - u))
     slope = np.maximum(alpha * np.sqrt(u / (1 - u)), min_slope)
     n = surface.normal_world
     across = np.where(np.abs(n[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
@@ -135,6 +136,7 @@ def probe_roughness(
     *,
     min_slope: float,
 ) -> RoughnessProbe:
+    # where min_slope decides, the slope does not depend on the roughness
     """Trace a third ray from the drawn points, where facets are as steep as the roughness says."""
     ids = np.flatnonzero(is_probed & (pairs.facets.slope > min_slope))
     middle = reflection_tracer.trace(
@@ -182,6 +184,7 @@ def backward_normals(
     """
     half = len(facets.slope)
     change = incident.light_linear[:half] - incident.light_linear[half:]
+    # where the environment is hidden differently
     change += (incident.visibility[:half] - incident.visibility[half:])[:, None] * around_linear
     along = (grad_incoming * change).sum(axis=1) / facets.slope
     return along[:, None] * facets.tangent_world

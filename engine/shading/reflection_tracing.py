@@ -104,6 +104,7 @@ class ReflectionTracer:
         surface, next_bounce = self.with_ambient(split.results, gbuffer), None
         if self.max_bounces > 1 and len(gbuffer.ray_ids):
             next_rays = reflected_rays(split.rays, gbuffer, self.offset)
+            # one bounce less each time
             next_bounce = replace(self, max_bounces=self.max_bounces - 1).trace(next_rays, record=record)
             incident = next_bounce.incident
             surface = replace(surface, visibility=incident.visibility, indirect_linear=incident.light_linear)
@@ -141,7 +142,7 @@ def backward_reflections(
     grad_light = split.expand(grad_incident.light_linear)[ray_ids]
     back = shade_backward(reflected.surface, light, frame, grad_light * gbuffer.alpha[:, None])
     grad_texels += back.sum_texels(len(grad_texels))
-    grad_alpha = -split.expand(grad_incident.visibility)
+    grad_alpha = -split.expand(grad_incident.visibility)  # visibility is the transmittance of the ray
     grad_alpha[ray_ids] += (grad_light * reflected.linear).sum(axis=1)
     grad_features, nothing = np.zeros((count, trace.features.shape[1])), np.zeros((count, 3))
     backward_gbuffer(

@@ -142,6 +142,7 @@ def shade_backward(
         count,
         ShadeBackward(_surface_arrays(surface, frame), light, split_sum_table(), blur, grad_rgb, out),
     )
+    # back from the map's frame to the world
     return out._replace(normal=out.normal @ frame, reflected=out.reflected @ frame)
 
 

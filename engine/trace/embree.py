@@ -147,7 +147,7 @@ class _EmbreeScene:
         lib.rtcSetGeometryBuildQuality(geometry, self._quality)
         lib.rtcCommitGeometry(geometry)
         lib.rtcAttachGeometry(self.handle, geometry)
-        lib.rtcReleaseGeometry(geometry)
+        lib.rtcReleaseGeometry(geometry)  # the scene holds the geometry now
         # Joined, since rtcCommitScene on one thread leaves another of TBB's spinning for ever.
         lib.rtcJoinCommitScene(self.handle)
         self._device.check(f"building the hierarchy over {count} {primitive_name}")

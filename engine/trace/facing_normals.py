@@ -57,7 +57,7 @@ def face_viewer(
     length = np.maximum(np.linalg.norm(sums, axis=1), 1e-9)
     blended = sums / length[:, None]
     along = (blended * directions_world).sum(axis=1) + MIN_VIEW_COSINE
-    away = (along > 0) & (length > 1e-9)
+    away = (along > 0) & (length > 1e-9)  # a sum of nothing has no side
     laid = blended - np.where(away, along, 0.0)[:, None] * directions_world
     shortened = np.where(away, np.maximum(np.linalg.norm(laid, axis=1), 1e-9), 1.0)
     return FacedNormals(laid / shortened[:, None], blended, length, shortened, away)

@@ -22,6 +22,7 @@ def add_gradients(parts: Sequence[GaussianGradients]) -> GaussianGradients:
         first = getattr(parts[0], name)
         total = np.zeros((len(ids), *first.shape[1:]), first.dtype)
         for part in parts:
+            # ids of a part are unique, so that no addition is lost
             total[place[part.ids]] += getattr(part, name)
         sums[name] = total
     return GaussianGradients(ids=ids, **sums)

@@ -107,12 +107,14 @@ def _hit_gradients(
     # --- color, and the direction in which it is seen ---
     t_view_origins = np.broadcast_to(rays.t_view_origin, len(rays)).astype(np.float64)[ray]
     has_viewer = np.isfinite(t_view_origins)
+    # no use of an infinite one, but 0 times infinity would be not-a-number
     t_view_origin = np.where(has_viewer, t_view_origins, 0.0)[:, None]
     view = np.where(has_viewer[:, None], hits.to_mean - t_view_origin * directions, directions)
     length = np.linalg.norm(view, axis=1, keepdims=True)
     view /= length
     sh = gaussians.sh[ids].astype(np.float64)
     color = 0.5 + np.einsum("hk,hkc->hc", sh_basis(view, gaussians.sh_degree), sh)
+    # a channel clamped at zero has no gradient
     grad_color = np.where(color > 0, weight[:, None] * output_gradients.rgb[ray], 0.0)
     grad_unit_view = np.einsum(
         "hki,hkc,hc->hi", sh_basis_gradients(view, gaussians.sh_degree), sh, grad_color
@@ -146,6 +148,7 @@ def _hit_gradients(
         is_median, output_gradients.depth_median[ray], 0.0
     )
     grad_t += np.einsum("hi,hi->h", grad_hit, directions)
+    # dt/do = -r1 / <d, r1>, and the gradient by d is t times that by o
     grad_position = grad_hit - (grad_t / hits.cosine)[:, None] * normals
     grad_origin = grad_position - np.where(has_viewer[:, None], grad_view, 0.0)
     grad_direction = hits.t[:, None] * grad_position

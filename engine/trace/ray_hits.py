@@ -77,6 +77,7 @@ def batched_ray_hits(
     first = 0
     while first < len(rays):
         begin = int(ends[first - 1]) if first else 0
+        # one ray at least, however many hits it has
         last = max(first + 1, int(np.searchsorted(ends, begin + HITS_PER_BATCH, side="right")))
         end = int(ends[last - 1])
         part = slice(first, last)
@@ -122,6 +123,7 @@ def _evaluate_hits(
     clamped = alpha > settings.alpha_max
     alpha = np.minimum(alpha, settings.alpha_max)
     wide = counts.astype(np.int64)
+    # products along rays as sums of logarithms: one running sum for all
     transmittance = np.exp(_segmented_exclusive_cumsum(np.log1p(-alpha), wide))
     return RayHits(
         counts=wide,

@@ -91,6 +91,7 @@ class ReferenceTracer:
     def transmittance(self, rays: RayBatch) -> Float32[np.ndarray, " r"]:
         """Return the transmittance along each ray; see the protocol."""
         parameters = self._reference_parameters()
+        # all hits count here; the threshold is applied to the result
         unlimited = self.settings.model_copy(
             update={"transmittance_min": 0.0, "second_phase_min": None, "max_hits": 2**31}
         )
@@ -118,6 +119,7 @@ class ReferenceTracer:
             ):
                 total += found
             visibility = result.features[:, -1]
+            # dL by the channel of ones is the weight of each Gaussian
             weights += _leaf_gradients(visibility.sum(), leaves)[-1][:, -1]
             if gradients.ray_errors is not None:
                 shared = (visibility * torch.tensor(gradients.ray_errors[piece], dtype=torch.float64)).sum()

@@ -115,6 +115,7 @@ class TriangleBvh:
         return EmbreeQuery(occluded8_address(), self._scene.handle)
 
     def _allocate_scratch(self, rays: int) -> Float32[np.ndarray, "c w"]:
+        # one row a thread, and one chunk of rays for each
         return allocate_embree_scratch(max(1, min(rays, self._threads)))
 
 

@@ -22,7 +22,7 @@ def table_cell(roughness: float, cosine: float) -> tuple[float, float, float]:
 @njit_no_refcount(forceinline=True)
 def table_normal(k: int, samples: int, o_x: float, o_z: float, alpha: float) -> tuple[float, float]:
     """Return x and z of the facet's normal that is sample ``k`` of so many."""
-    u, v = (k + 0.5) / samples, reverse_bits(np.uint32(k)) * UINT32_TO_UNIT
+    u, v = (k + 0.5) / samples, reverse_bits(np.uint32(k)) * UINT32_TO_UNIT  # Hammersley points
     h_x, _, h_z = sample_visible_normal(o_x, 0.0, o_z, alpha, u, v)
     return h_x, h_z
 
@@ -33,11 +33,12 @@ def _reflected_share(o_x: float, o_z: float, alpha: float, ior: float, samples: 
     for k in range(samples):
         h_x, h_z = table_normal(k, samples, o_x, o_z, alpha)
         cos_d = o_x * h_x + o_z * h_z
-        i_z = 2.0 * cos_d * h_z - o_z
+        i_z = 2.0 * cos_d * h_z - o_z  # z of o reflected at h
         if i_z > 0.0:
             fresnel = 1.0
             if ior > 0.0:
                 fresnel, _ = fresnel_dielectric(cos_d, ior)
+            # F G1(i): what is left of F D G2 / (4 o_z i_z) over the density of visible normals
             total += fresnel * ggx_masking(i_z, alpha)
     return total / samples
 
@@ -52,7 +53,7 @@ def _kept_share(o_x: float, o_z: float, alpha: float, eta: float, samples: int) 
         up = 2.0 * cos_o * h_z - o_z
         if up > 0.0:
             total += share * ggx_masking(up, alpha)
-        down = (cos_o / eta - cos_t) * h_z - o_z / eta
+        down = (cos_o / eta - cos_t) * h_z - o_z / eta  # z of o refracted at h
         if down < 0.0:
             total += (1.0 - share) * ggx_masking(-down, alpha)
     return total / samples

@@ -47,7 +47,7 @@ def _pixel_direction(directions: Float32[np.ndarray, "h w 3"], y: int, x: int, u
     centre = directions[y, x]
     left, right = max(x - 1, 0), min(x + 1, width - 1)
     high, low = max(y - 1, 0), min(y + 1, height - 1)
-    along = (u - 0.5) / max(right - left, 1)
+    along = (u - 0.5) / max(right - left, 1)  # one pixel at the picture's edges, else two
     down = (v - 0.5) / max(low - high, 1)
     a, b = directions[y, left], directions[y, right]
     c, d = directions[high, x], directions[low, x]
@@ -114,9 +114,10 @@ def start_paths(
         o_x, o_y, o_z = camera.origin_world[0], camera.origin_world[1], camera.origin_world[2]
         if camera.aperture > 0.0:
             u, v = numbers[1, 0, n], numbers[1, 1, n]
-            radius, angle = 0.5 * camera.aperture * math.sqrt(u), 2.0 * math.pi * v
+            radius, angle = 0.5 * camera.aperture * math.sqrt(u), 2.0 * math.pi * v  # evenly over the disc
             a, b = radius * math.cos(angle), radius * math.sin(angle)
             l_x, l_y, l_z = a * across_x + b * up_x, a * across_y + b * up_y, a * across_z + b * up_z
+            # the plane in focus is across the axis: t is longer for oblique rays
             forward = d_x * axis[0] + d_y * axis[1] + d_z * axis[2]
             t = camera.focus_distance / max(forward, 1e-6)
             o_x, o_y, o_z = o_x + l_x, o_y + l_y, o_z + l_z

@@ -27,7 +27,7 @@ def eval_environment(lights: LightArrays, d_x: float, d_y: float, d_z: float) ->
     radiance = lights.environment_linear
     height, width, _ = radiance.shape
     u, v, _ = _environment_uv(lights, d_x, d_y, d_z)
-    x, y = u * width - 0.5, min(max(v * height - 0.5, 0.0), height - 1.0)
+    x, y = u * width - 0.5, min(max(v * height - 0.5, 0.0), height - 1.0)  # no wrap over the poles
     i, j = math.floor(x), min(int(y), max(height - 2, 0))
     x, y = x - i, y - j
     left, right = int(i) % width, (int(i) + 1) % width
@@ -61,6 +61,7 @@ def environment_pdf(lights: LightArrays, d_x: float, d_y: float, d_z: float) -> 
     height, width = shares.shape
     u, v, sine = _environment_uv(lights, d_x, d_y, d_z)
     i, j = min(int(u * width), width - 1), min(int(v * height), height - 1)
+    # share of the texel over its solid angle: 2 pi / width by pi / height by the sine
     return shares[j, i] * width * height / (2.0 * math.pi * math.pi * max(sine, 1e-9))
 
 
@@ -75,6 +76,7 @@ def sample_cdf(cdf: Float64[np.ndarray, " c"], u: float) -> tuple[int, float]:
         else:
             high = middle
     span = cdf[low + 1] - cdf[low]
+    # below 1, so that the position stays inside its texel
     return low, min(max((u - cdf[low]) / span, 0.0), 1.0 - 1e-9) if span > 0.0 else 0.5
 
 

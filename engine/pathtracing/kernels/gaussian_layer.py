@@ -91,6 +91,7 @@ def decode_srgb(display: float) -> float:
 def _mirrored_color(color_srgb: float, share: float, reflectance: float) -> float:
     """Return a premultiplied display color of coverage ``share`` in mirrors of a linear reflectance."""
     if reflectance == 1.0:
+        # encoding is not linear: the color is scaled without its coverage
         return color_srgb
     return share * encode_srgb(reflectance * decode_srgb(color_srgb / share))
 
@@ -153,6 +154,7 @@ def _query_layer_light(
     lights, shadows, k = query.lights, query.shadows, query.k
     shadowed, relit, additive = shares
     (x, y, z), (g_r, g_g, g_b) = point, weight
+    # the second number: surfaces take the first
     _, pick = uniform_pair(paths.keys[p], paths.samples[p], first_pair + LIGHT_CHOICE_SAMPLE)
     l, chance = sample_light_index(lights, x, y, z, pick)
     if l < 0:
@@ -162,6 +164,7 @@ def _query_layer_light(
     n_x, n_y, n_z = normalize(normal[0], normal[1], normal[2])
     cosine = max(n_x * w_x + n_y * w_y + n_z * w_z, 0.0)
     taking = relit + (additive if lights.adds_light[l] else 0.0)
+    # a Lambertian surface with the layer's normal; a light in one direction has no density
     factor = taking * cosine / (math.pi * chance * (pdf if pdf > 0.0 else 1.0))
     shadows.radiance_linear[k, 0] = g_r * l_r * factor
     shadows.radiance_linear[k, 1] = g_g * l_g * factor
@@ -177,6 +180,7 @@ def _query_layer_light(
     shadows.directions_world[k, 1] = w_y
     shadows.directions_world[k, 2] = w_z
     shadows.passes_glass[k] = True
+    # short of the light's own surface
     shadows.t_max[k] = reach * SHADOW_RAY_SCALE if reach < INFINITE_DISTANCE else math.inf
 
 
@@ -202,6 +206,7 @@ def intersect_gaussian_layers(
         d, o = paths.directions_world[p], paths.origins_world[p]
         clear = paths.flags[p] & FLAG_CLEAR != 0
         features = layer.features[k]
+        # features are sums along the ray; over the coverage they are means
         shares = features[SHADOWED] / share, features[RELIT] / share, features[ADDITIVE] / share
         relit = shares[1]
         base = 1.0 - relit + features[AMBIENT] / share
@@ -239,6 +244,7 @@ def intersect_gaussian_layers(
         if known:
             w, rgb = paths.throughput[p], layer.rgb[k]
             add_radiance(
+                # Taken away again is left b, which the background adds later.
                 paths, p,
                 w[0] * (decode_srgb(rgb[0] + left * encode_srgb(b_r)) - left * b_r),
                 w[1] * (decode_srgb(rgb[1] + left * encode_srgb(b_g)) - left * b_g),
@@ -266,6 +272,7 @@ def add_layer_light(
     for k in range(first, last):
         p = active[k]
         for channel in range(3):
+            # taken: light that the meshes and casters keep off, but not what is dark already
             reached = light.mesh_transmittance[k, channel] * light.caster_transmittance[k]
             taken = light.other_transmittance[k] * (1.0 - reached)
             amount = light.radiance[k, channel] * reached + light.occluded_radiance[k, channel] * taken

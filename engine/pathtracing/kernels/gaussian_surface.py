@@ -91,7 +91,7 @@ def intersect_gaussian_surfaces(
         if chance <= MIN_COVERAGE:
             continue
         if left < layer.min_transmittance:  # the tracer stopped looking here
-            chance /= share
+            chance /= share  # what the tracer did not look for counts as covered by the same
         pair = FIRST_PAIR + depth * PAIRS_PER_BOUNCE
         choice, roulette = uniform_pair(paths.keys[p], paths.samples[p], pair)
         if choice >= chance:
@@ -122,10 +122,12 @@ def intersect_gaussian_surfaces(
         _draw_samples(paths, p, pair + 1, samples.random_numbers)
         o, d = paths.origins_world[p], paths.directions_world[p]
         n_x, n_y, n_z = normalize(normals[k, 0], normals[k, 1], normals[k, 2])
+        # features are sums along the ray; over that of MATERIAL they are means
         part = 1.0 / float(features[k, MATERIAL])
         lift = features[k, RAY_OFFSET] * part
         point = (
             o[0] + distance * d[0] + lift * n_x,
+            # off the surface, whose Gaussians would shadow their own point
             o[1] + distance * d[1] + lift * n_y,
             o[2] + distance * d[2] + lift * n_z,
         )
@@ -166,6 +168,7 @@ def start_paths_at_surfaces(
             interactions.normals_world[k],
         )
         origin = float(point[0]), float(point[1]), float(point[2])
+        # as if the camera had met it
         reset_path(paths, k, origin, (float(d[0]), float(d[1]), float(d[2])), FLAG_GAUSSIAN_SURFACE)
         _draw_samples(paths, k, FIRST_PAIR + 1, scratch.random_numbers)
         material = interactions.materials[k]

@@ -48,6 +48,7 @@ def scatter_mirror(paths: PathArrays, p: int, point: SurfacePoint, reflectance: 
     red, green, blue = reflectance
     d = paths.directions_world[p]
     r_x, r_y, r_z = reflect(d[0], d[1], d[2], s_x, s_y, s_z)
+    # an interpolated normal may send it into the surface: the face's own then
     if r_x * n_x + r_y * n_y + r_z * n_z <= 0.0:
         r_x, r_y, r_z = reflect(d[0], d[1], d[2], n_x, n_y, n_z)
     paths.flags[p] &= ~FLAG_CAMERA_RAY
@@ -73,6 +74,7 @@ def scatter_smooth_glass(
     eta = relative_ior(glass)
     cosine = -(d[0] * s_x + d[1] * s_y + d[2] * s_z)
     share, cos_t = fresnel_dielectric(min(cosine, 1.0), eta)
+    # two ways on: what is behind is no longer one direction
     if share < 1.0 and eta != 1.0:
         paths.flags[p] &= ~FLAG_CLEAR
     if eta != 1.0 and choice < share:
@@ -102,6 +104,7 @@ def _rough_glass_gain(glass: Glass, o_z: float) -> float:
     if not materials.energy_compensation[m]:
         return 1.0
     table = materials.coat_tables[m] + (0 if is_entering else 1)
+    # the directional albedo of one bounce, scaled up to 1
     return 1.0 / table_value(materials.coat_albedo[table], o_z, materials.roughness[m])
 
 
@@ -132,9 +135,11 @@ def scatter_rough_glass(
     back = offset_ray_origin(x, y, z, -n_x, -n_y, -n_z)
     # --- a sample of a light ---
     w = paths.throughput[p]
+    # directly seen light is not cut off
     clamp = query.integrator.clamp if paths.flags[p] & FLAG_SCATTERED else math.inf
     l, share, (w_x, w_y, w_z), distance, (l_r, l_g, l_b), l_pdf = draw_light(lights, point.position, samples)
     i_z = w_x * s_x + w_y * s_y + w_z * s_z
+    # both normals must agree on the side, or light would leak through
     if i_z * (w_x * n_x + w_y * n_y + w_z * n_z) > 0.0 and l_r + l_g + l_b > 0.0:
         value, pdf = rough_dielectric_eval(
             o_x, o_y, o_z,

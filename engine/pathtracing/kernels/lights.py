@@ -43,7 +43,7 @@ def _spot_falloff(lights: LightArrays, l: int, way_x: float, way_y: float, way_z
     axis = lights.axes[l]
     cosine = axis[0] * way_x + axis[1] * way_y + axis[2] * way_z
     outer, inner = lights.cosines[l, 0], lights.cosines[l, 1]
-    share = min(max((cosine - outer) / (inner - outer), 0.0), 1.0)
+    share = min(max((cosine - outer) / (inner - outer), 0.0), 1.0)  # soft edge between both angles
     return share * share
 
 
@@ -57,15 +57,18 @@ def light_importance(lights: LightArrays, l: int, p_x: float, p_y: float, p_z: f
     way_x = p_x - lights.positions_world[l, 0]
     way_y = p_y - lights.positions_world[l, 1]
     way_z = p_z - lights.positions_world[l, 2]
+    # no division by zero at the light itself
     squared = max(way_x * way_x + way_y * way_y + way_z * way_z, 1e-20)
     if kind == RECTANGLE:
         axis = lights.axes[l]
         if axis[0] * way_x + axis[1] * way_y + axis[2] * way_z <= 0.0:
             return 0.0
+        # near it at most pi times the radiance, as under an infinite plane
         return power * lights.areas[l] / (squared + lights.areas[l] / math.pi)
     if kind == SPHERE:
         return power * lights.areas[l] / squared
     if kind == MESH:
+        # a quarter: the mean projected area of a convex body (Cauchy)
         return 0.25 * power * lights.areas[l] / (squared + lights.areas[l] / math.pi)
     if kind == SPOT:
         distance = math.sqrt(squared)
@@ -142,6 +145,7 @@ def emitter_hit_pdf(
     ``distance`` is that of the place and ``cosine`` the cosine there.
     """
     if lights.kinds[l] == SPHERE:
+        # a ball is sampled by solid angle, all others by area
         x, y, z = (
             lights.positions_world[l, 0] - o[0],
             lights.positions_world[l, 1] - o[1],
@@ -168,6 +172,7 @@ def _sample_sphere(
     way_x = lights.positions_world[l, 0] - p_x
     way_y = lights.positions_world[l, 1] - p_y
     way_z = lights.positions_world[l, 2] - p_z
+    # squared radius of the ball
     squared, of_ball = way_x * way_x + way_y * way_y + way_z * way_z, lights.areas[l] / math.pi
     if squared <= of_ball:
         return 0.0, 0.0, 1.0, INFINITE_DISTANCE, 0.0, 0.0, 0.0, 1.0
@@ -178,6 +183,7 @@ def _sample_sphere(
     sine = math.sqrt(max(1.0 - cosine * cosine, 0.0))
     a_x, a_y, a_z, b_x, b_y, b_z = orthonormal_basis(way_x, way_y, way_z)
     a, b = sine * math.cos(2.0 * math.pi * v), sine * math.sin(2.0 * math.pi * v)
+    # to the near side of the ball
     reach = distance * cosine - math.sqrt(max(of_ball - squared * sine * sine, 0.0))
     rgb = lights.rgb_linear[l]
     return (
@@ -201,7 +207,7 @@ def _sample_mesh(
     row, u = sample_cdf(lights.mesh_cdf[first : last + 1], u)
     face = lights.mesh_rows[l, 2] + row
     corners, uv = lights.mesh_corners_world[face], lights.mesh_uv[face]
-    root = math.sqrt(u)
+    root = math.sqrt(u)  # square root: evenly over a triangle
     a, b, c = 1.0 - root, root * (1.0 - v), root * v
     way_x = a * corners[0, 0] + b * corners[1, 0] + c * corners[2, 0] - p_x
     way_y = a * corners[0, 1] + b * corners[1, 1] + c * corners[2, 1] - p_y
@@ -222,7 +228,7 @@ def _sample_mesh(
     n_x, n_y, n_z = s_y * t_z - s_z * t_y, s_z * t_x - s_x * t_z, s_x * t_y - s_y * t_x
     length = max(math.sqrt(n_x * n_x + n_y * n_y + n_z * n_z), 1e-30)
     cosine = abs(n_x * way_x + n_y * way_y + n_z * way_z) / length
-    if cosine <= 1e-9:
+    if cosine <= 1e-9:  # seen edge on it sends nothing, and its density would be infinite
         return way_x, way_y, way_z, distance, 0.0, 0.0, 0.0, 1.0
     red, green, blue = eval_emission(
         lights,

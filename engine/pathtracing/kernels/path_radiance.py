@@ -39,6 +39,7 @@ def add_radiance(paths: PathArrays, p: int, red: float, green: float, blue: floa
     if paths.flags[p] & FLAG_SCATTERED:
         most = max(red, green, blue)
         if most > clamp:
+            # all channels alike: the color stays
             red, green, blue = red * clamp / most, green * clamp / most, blue * clamp / most
     paths.radiance_linear[p, 0] += red
     paths.radiance_linear[p, 1] += green
@@ -54,11 +55,13 @@ def shade_miss(
     red, green, blue = eval_background(lights, environment, integrator, paths.flags[p], d[0], d[1], d[2])
     share = 1.0
     if environment >= 0 and paths.pdf[p] > 0.0:
+        # the environment could also have been found by a light query: the balance heuristic's share
         o = paths.origins_world[p]
         pdf = light_probability(lights, environment, o[0], o[1], o[2]) * environment_pdf(
             lights, d[0], d[1], d[2]
         )
         share = paths.pdf[p] / (paths.pdf[p] + pdf)
+    # an environment that the camera does not see leaves the background open
     if paths.flags[p] & FLAG_CAMERA_RAY and not (environment >= 0 and integrator.environment_visible):
         paths.coverage[p] = 1.0 - paths.transmittance[p]
     w = paths.throughput[p]
@@ -81,7 +84,7 @@ def shade_emitter(
     if cosine <= 0.0:
         return
     share = 1.0
-    if paths.pdf[p] > 0.0:
+    if paths.pdf[p] > 0.0:  # the camera, mirrors and glass find lights in no other way
         o = paths.origins_world[p]
         pdf = light_probability(lights, l, o[0], o[1], o[2]) * emitter_hit_pdf(lights, l, o, distance, cosine)
         share = paths.pdf[p] / (paths.pdf[p] + pdf)

@@ -63,6 +63,7 @@ def _fill_samples(
     active: Int32[np.ndarray, " n"],
     faces: Int32[np.ndarray, " n"],
     first: int,
+    # of a block at a time: hashes of many paths are vectorized
     last: int,
     first_pair: int,
 ) -> None:
@@ -183,6 +184,7 @@ def shade_surfaces(first: int, last: int, scratch: PathScratch, bounce: Bounce) 
         facing = -(d[0] * n_x + d[1] * n_y + d[2] * n_z)
         m = surfaces.material_ids[face]
         kind = materials.kinds[m]
+        # Beer's law, on the way inside of glass up to this hit
         if paths.medium_ids[p] >= 0:
             medium = materials.absorption[paths.medium_ids[p]]
             for channel in range(3):
@@ -190,6 +192,7 @@ def shade_surfaces(first: int, last: int, scratch: PathScratch, bounce: Bounce) 
         is_guide = paths.flags[p] & FLAG_CAMERA_RAY != 0 and paths.mesh_visibility[p] == 0.0
         if is_guide:
             paths.mesh_visibility[p] = paths.transmittance[p]
+            # white until the material is known; mirrors and glass stay so
             _write_denoiser_guides(paths, p, 1.0, 1.0, 1.0, n_x, n_y, n_z)
         # --- light that the surface sends by itself ---
         l = materials.light_ids[m]
@@ -197,12 +200,14 @@ def shade_surfaces(first: int, last: int, scratch: PathScratch, bounce: Bounce) 
             shade_emitter(paths, p, lights, l, hits.distances[k], facing, 0.0, 0.0, integrator)
         elif l >= 0:
             u_t, v_t = interpolate_uv(surfaces.corner_uv[face], a, b, c)
+            # meshes shine on both sides
             shade_emitter(paths, p, lights, l, hits.distances[k], abs(facing), u_t, v_t, integrator)
         if kind == EMITTER or depth >= integrator.max_depth:
             paths.is_alive[p] = False
             continue
         # --- the way on ---
         point = interpolate_corners(surfaces.corners_world[face], a, b, c)
+        # from here on the normal is on the viewer's side
         if facing < 0.0:
             n_x, n_y, n_z = -n_x, -n_y, -n_z
         s_x, s_y, s_z = shading_normal(

@@ -63,7 +63,7 @@ def specular_probability(o_z: float, bsdf: Bsdf, coat_albedo: Float64[np.ndarray
     specular = (1.0 - metallic) * sheen + metallic * (red + green + blue) / 3.0
     if ground <= 0.0:
         return 1.0
-    return min(max(specular / (specular + ground), 0.1), 0.9)
+    return min(max(specular / (specular + ground), 0.1), 0.9)  # neither lobe is left without samples
 
 
 @njit_no_refcount(forceinline=True)
@@ -85,6 +85,7 @@ def principled_eval(o: Vec3, i: Vec3, bsdf: Bsdf, tables: AlbedoTables) -> tuple
     fresnel, _ = fresnel_dielectric(cos_d, bsdf.ior)
     weight = schlick_weight(cos_d)
     loss = 0.0
+    # Turquin: what one bounce loses, 1/E - 1, comes back tinted by the metal
     if bsdf.energy_compensation and metallic > 0.0:
         loss = 1.0 / table_value(tables.ggx_albedo, o_z, roughness) - 1.0
     plain = (1.0 - metallic) * fresnel
@@ -96,11 +97,12 @@ def principled_eval(o: Vec3, i: Vec3, bsdf: Bsdf, tables: AlbedoTables) -> tuple
         ground = (1.0 - metallic) * i_z / math.pi
         if bsdf.substrate == BURLEY:
             at_o, at_i = schlick_weight(o_z), schlick_weight(i_z)
-            retro = 2.0 * roughness * cos_d * cos_d
+            retro = 2.0 * roughness * cos_d * cos_d  # R_R of Burley's retro-reflection (2015)
             ground *= (1.0 - 0.5 * at_o) * (1.0 - 0.5 * at_i) + retro * (
                 at_o + at_i + at_o * at_i * (retro - 1.0)
             )
         else:
+            # Kelemen: normalized by what the coat leaves on average
             left = 1.0 - table_value(tables.coat_mean_albedo, 0.0, roughness)
             ground *= (
                 (1.0 - table_value(tables.coat_albedo, o_z, roughness))
@@ -110,6 +112,7 @@ def principled_eval(o: Vec3, i: Vec3, bsdf: Bsdf, tables: AlbedoTables) -> tuple
         f_r += ground * red
         f_g += ground * green
         f_b += ground * blue
+    # G1(o) D / (4 o_z), the density of visible normals
     pdf = share * density * masking_o + (1.0 - share) * i_z / math.pi
     return f_r, f_g, f_b, pdf
 
@@ -126,7 +129,7 @@ def principled_sample(
     alpha = max(bsdf.roughness * bsdf.roughness, MIN_ALPHA)
     h_x, h_y, h_z = sample_visible_normal(o_x, o_y, o_z, alpha, u, v)
     twice = 2.0 * (o_x * h_x + o_y * h_y + o_z * h_z)
-    return twice * h_x - o_x, twice * h_y - o_y, twice * h_z - o_z
+    return twice * h_x - o_x, twice * h_y - o_y, twice * h_z - o_z  # o reflected at h
 
 
 @njit_no_refcount(forceinline=True)

@@ -28,26 +28,28 @@ def rough_dielectric_eval(
     """Return value times cosine, and the solid-angle density of :func:`rough_dielectric_sample`."""
     if o_z <= 0.0 or i_z == 0.0:
         return 0.0, 0.0
-    ratio = 1.0 if i_z > 0.0 else eta
+    ratio = 1.0 if i_z > 0.0 else eta  # of the half vector: of reflection, or generalized to refraction
     h_x, h_y, h_z = o_x + ratio * i_x, o_y + ratio * i_y, o_z + ratio * i_z
     length = math.sqrt(h_x * h_x + h_y * h_y + h_z * h_z)
     if length < 1e-9:
         return 0.0, 0.0
-    if h_z < 0.0:
+    if h_z < 0.0:  # on the viewer's side
         length = -length
     h_x, h_y, h_z = h_x / length, h_y / length, h_z / length
     cos_o = o_x * h_x + o_y * h_y + o_z * h_z
     cos_i = i_x * h_x + i_y * h_y + i_z * h_z
+    # facets that either side would see from behind
     if cos_o <= 0.0 or cos_i * i_z <= 0.0:
         return 0.0, 0.0
     share, _ = fresnel_dielectric(min(cos_o, 1.0), eta)
     visible = ggx_density(h_z, alpha) * ggx_masking(o_z, alpha) * cos_o / o_z
     if i_z > 0.0:
-        pdf = share * visible / (4.0 * cos_o)
+        pdf = share * visible / (4.0 * cos_o)  # dh/di of reflection
     else:
         spread = cos_o + eta * cos_i
+        # dh/di of refraction
         pdf = (1.0 - share) * visible * eta * eta * -cos_i / max(spread * spread, 1e-20)
-    return pdf * ggx_masking(abs(i_z), alpha), pdf
+    return pdf * ggx_masking(abs(i_z), alpha), pdf  # what is left of G2 is G1(i)
 
 
 @njit_no_refcount()

@@ -13,13 +13,14 @@ from octasplat.engine.core.compilation import kernel
 from octasplat.engine.trace.kernels.native import njit_no_refcount
 
 UINT32_TO_UNIT = 2.0**-32
-ONE_MINUS_EPSILON = 1.0 - 2.0**-24
+ONE_MINUS_EPSILON = 1.0 - 2.0**-24  # the largest float32 below 1: numbers stay below 1 in either precision
 
 
 @njit_no_refcount(inline="always")
 def hash_uint32(x: np.uint32) -> np.uint32:
     """Return 32 well mixed bits of a uint32."""
     x = np.uint32(x)
+    # lowbias32 (C. Wellons, https://nullprogram.com/blog/2018/07/31/)
     x = np.uint32((x ^ (x >> np.uint32(16))) * np.uint32(0x7FEB352D))
     x = np.uint32((x ^ (x >> np.uint32(15))) * np.uint32(0x846CA68B))
     return np.uint32(x ^ (x >> np.uint32(16)))
@@ -48,6 +49,7 @@ def reverse_bits(x: np.uint32) -> np.uint32:
 def _laine_karras_permutation(x: np.uint32, seed: np.uint32) -> np.uint32:
     """Permute bits: each is changed by a hash of the bits below it (Laine and Karras)."""
     x = np.uint32(x + seed)
+    # even multipliers: a product changes only bits above those it comes from
     x = np.uint32(x ^ np.uint32(x * np.uint32(0x6C50B47C)))
     x = np.uint32(x ^ np.uint32(x * np.uint32(0xB82F1E52)))
     x = np.uint32(x ^ np.uint32(x * np.uint32(0xC7AFE638)))
@@ -71,6 +73,7 @@ def sobol_reversed_bits(index: np.uint32) -> tuple[np.uint32, np.uint32]:
 @njit_no_refcount()
 def pixel_key(seed: int, pixel: int) -> np.uint32:
     """Return what the numbers of a pixel begin from."""
+    # 2^32 over the golden ratio: neighbors get unlike keys
     return hash_uint32(np.uint32(hash_uint32(np.uint32(seed)) + np.uint32(0x9E3779B9) * np.uint32(pixel)))
 
 

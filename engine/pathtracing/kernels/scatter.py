@@ -54,6 +54,7 @@ def spawn_ray(
 ) -> None:
     """Start the next ray of a path; its viewer stays behind, and is lost once the path has scattered."""
     o = paths.origins_world[p]
+    # scattered light is seen from no single place, from which harmonics could be evaluated
     if pdf > 0.0:
         paths.t_view_origin[p] = AT_INFINITY
     else:
@@ -87,6 +88,7 @@ def queue_shadow_ray(
     shadows.directions_world[k, 0] = w_x
     shadows.directions_world[k, 1] = w_y
     shadows.directions_world[k, 2] = w_z
+    # short of the light's own surface
     shadows.t_max[k] = distance * SHADOW_RAY_SCALE if distance < INFINITE_DISTANCE else np.inf
 
 
@@ -139,6 +141,7 @@ def survives_roulette(paths: PathArrays, p: int, roulette: float) -> bool:
     if paths.flags[p] & FLAG_CLEAR != 0:
         return True
     w = paths.throughput[p]
+    # some end always, or paths between white walls would go on to the last bounce
     stay = min(max(w[0], w[1], w[2]), 0.95)
     if roulette >= stay:
         paths.is_alive[p] = False
@@ -192,9 +195,11 @@ def scatter_path(
         i = w_x * a_x + w_y * a_y + w_z * a_z, w_x * b_x + w_y * b_y + w_z * b_z, i_z
         f_r, f_g, f_b, pdf = surface_eval(o, i, is_diffuse, bsdf, tables)
         factor = 1.0 / share
+        # a light without extent is found by no other path, so that glass must let it through
         shadows.passes_glass[k] = l_pdf == 0.0
         if l_pdf > 0.0:
             l_pdf *= share
+            # balance heuristic, where both ways can find the light
             factor = 1.0 / (l_pdf + pdf) if lights.is_hittable[l] else 1.0 / l_pdf
         w = paths.throughput[p]
         radiance = w[0] * f_r * l_r * factor, w[1] * f_g * l_g * factor, w[2] * f_b * l_b * factor

@@ -57,7 +57,7 @@ def _trace_occlusion(
     transmittance: Float32[np.ndarray, "n 3"],
 ) -> int:
     """Set the light of occluded rows among the first ``count`` to zero."""
-    scratch.t_starts[0] = 0.0
+    scratch.t_starts[0] = 0.0  # one start for all rays
     rays = TriangleRays(
         shadows.origins_world, shadows.directions_world, scratch.t_starts[:1], shadows.t_max, scratch.rows
     )
@@ -98,6 +98,7 @@ def _trace_glass(
         closest_hits(queries.closest_hit_glass, rays, 0, count, False, scratch.embree, met)
         left = 0
         for i in range(count):
+            # rays that meet no more glass leave the list with what they have
             if scratch.faces[i] < 0:
                 continue
             place = scratch.rows[i]
@@ -114,13 +115,14 @@ def _trace_glass(
                 and materials.roughness[m] >= MIN_GLASS_ROUGHNESS
                 and materials.iors[m] != 1.0
             ):
-                reflectance = 0.0
+                reflectance = 0.0  # goes on by paths from its own surface
             t = scratch.distances[i]
             # Out of the glass: what it absorbed on the way.
             length = float(t - scratch.t_starts[place]) if cosine > 0.0 else 0.0
             for channel in range(3):
                 passed = math.exp(-materials.absorption[m, channel] * length)
                 transmittance[k, channel] *= reflectance * materials.colors_linear[m, channel] * passed
+            # behind the surface, by more than the rounding of t
             scratch.t_starts[place] = t * RESTART_SCALE + RESTART_OFFSET
             scratch.rows[left] = place
             left += 1
@@ -159,7 +161,7 @@ def shadow_transmittance(
         count = _trace_occlusion(queries.any_hit_opaque, shadows, scratch, count, transmittance)
         if queries.closest_hit_glass.scene != 0:
             for i in range(count):
-                scratch.rows[i] -= start
+                scratch.rows[i] -= start  # places in the block, by which the starts are kept
             _trace_glass(
                 queries,
                 surfaces,

@@ -28,6 +28,7 @@ def smooth_normals(
             a, b, c = corners[f, place], corners[f, (place + 1) % 3], corners[f, (place + 2) % 3]
             u, v = b - a, c - a
             cross = np.cross(u, v)
+            # exact also for small angles
             angles[f, place] = math.atan2(math.sqrt((cross * cross).sum()), (u * v).sum())
             if place == 0:
                 facing[f] = cross / max(math.sqrt((cross * cross).sum()), 1e-300)
@@ -46,5 +47,5 @@ def smooth_normals(
             normal = normals[order[i] // 3, order[i] % 3]
             if length > 1e-12:
                 normal[0], normal[1], normal[2] = x / length, y / length, z / length
-            else:
+            else:  # opposite faces cancel
                 normal[0], normal[1], normal[2] = own[0], own[1], own[2]

@@ -64,6 +64,7 @@ def offset_ray_origin(
     p_x: float, p_y: float, p_z: float, n_x: float, n_y: float, n_z: float
 ) -> tuple[float, float, float]:
     """Move a point a little off a surface along n, so that rounding does not put it behind the surface."""
+    # in proportion to float32's rounding of the coordinates
     step = RAY_OFFSET_SCALE * max(abs(p_x), abs(p_y), abs(p_z), 1e-3)
     return p_x + step * n_x, p_y + step * n_y, p_z + step * n_z
 
@@ -86,6 +87,7 @@ def eval_material(
     texture = materials.metallic_roughness_textures[m]
     if texture >= 0:
         _, t_g, t_b = eval_texture(materials, texture, u, v)
+        # channels as in glTF: green is roughness, blue metallic
         roughness, metallic = roughness * t_g, metallic * t_b
     return red, green, blue, metallic, roughness
 
@@ -124,7 +126,7 @@ def eval_normal_map(
     a_u, a_v = float(uv[1, 0]) - uv[0, 0], float(uv[1, 1]) - uv[0, 1]
     b_u, b_v = float(uv[2, 0]) - uv[0, 0], float(uv[2, 1]) - uv[0, 1]
     area = a_u * b_v - a_v * b_u
-    if abs(area) < 1e-20:
+    if abs(area) < 1e-20:  # no area in the texture: no direction in which u grows
         return s_x, s_y, s_z
     a_x, a_y, a_z = (
         float(corners[1, 0]) - corners[0, 0],
@@ -136,6 +138,7 @@ def eval_normal_map(
         float(corners[2, 1]) - corners[0, 1],
         float(corners[2, 2]) - corners[0, 2],
     )
+    # dP/du and -dP/dv from the edges, then orthonormal to s
     t_x, t_y, t_z = (
         (b_v * a_x - a_v * b_x) / area,
         (b_v * a_y - a_v * b_y) / area,
@@ -154,6 +157,7 @@ def eval_normal_map(
     )
     x, y, z = eval_texture(materials, texture, u, v)
     scale = materials.normal_scales[m]
+    # not below the surface
     x, y, z = scale * (2.0 * x - 1.0), scale * (2.0 * y - 1.0), max(2.0 * z - 1.0, 1e-3)
     x, y, z = normalize(x * t_x + y * w_x + z * s_x, x * t_y + y * w_y + z * s_y, x * t_z + y * w_z + z * s_z)
     if x * d_x + y * d_y + z * d_z > -1e-4 or x * n_x + y * n_y + z * n_z <= 0.0:

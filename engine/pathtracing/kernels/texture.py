@@ -17,6 +17,7 @@ def eval_texture(
         materials.texture_sizes[texture, 2],
     )
     texels = materials.texels_linear
+    # texel centers lie at halves
     x, y = (u - math.floor(u)) * width - 0.5, (v - math.floor(v)) * height - 0.5
     i, j = math.floor(x), math.floor(y)
     x, y = x - i, y - j

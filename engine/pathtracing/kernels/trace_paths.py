@@ -43,11 +43,13 @@ def trace_paths(
             active[k] = begin + k
         for depth in range(integrator.max_depth + 1):
             # --- what the rays meet ---
+            # only the camera has a near limit
             scratch.t_starts[0] = t_min[0] if depth == 0 else np.float32(0.0)
             rays = TriangleRays(
                 paths.origins_world, paths.directions_world, scratch.t_starts[:1], t_max, active
             )
             met = TriangleHitArrays(hits.distances, hits.faces, hits.barycentrics)
+            # neighbors have about one direction at the camera only
             closest_hits(queries.closest_hit, rays, 0, left, depth == 0, scratch.embree, met)
             # --- surfaces, and light that reaches them ---
             shade_surfaces(0, left, scratch, Bounce(paths, active, depth, hits, scene, integrator, shadows))

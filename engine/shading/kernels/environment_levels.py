@@ -109,6 +109,7 @@ def lobe_rows(
     for number in range(first_row, last_row):
         row, column = number // (2 * height), number % (2 * height)
         polar = math.pi * (row + 0.5) / height
+        # rows of texels within reach of the lobe
         top = max(0, int((polar - reach) / texel - 1.0))
         bottom = min(source_height, int((polar + reach) / texel + 2.0))
         x, y, z = texel_direction(row, column, height)
@@ -125,7 +126,7 @@ def lobe_rows(
                     continue
                 if not counting:
                     columns[place] = j * 2 * source_height + i
-                    weights[place] = weight * ring
+                    weights[place] = weight * ring  # times the texel's solid angle
                     total += weight * ring
                 place += 1
         if counting:
@@ -179,7 +180,7 @@ def look_up(
     fraction_x, fraction_y = across - left, down - top
     first, second = int(left) % width, (int(left) + 1) % width
     upper, lower = int(top), int(top) + 1
-    if upper < 0 or lower >= height:
+    if upper < 0 or lower >= height:  # beyond the last row's center: no slope towards the pole
         upper = lower = min(max(upper, 0), height - 1)
         row_y = 0.0
     a, b = offset + upper * width, offset + lower * width

@@ -51,7 +51,7 @@ def add_to_texels(
     """Add gradients by the colors to those by the texels, in the order of the rays: always the same sums."""
     for r in range(len(directions_world)):
         red, green, blue = grad_colors[r, 0], grad_colors[r, 1], grad_colors[r, 2]
-        if red == 0.0 and green == 0.0 and blue == 0.0:
+        if red == 0.0 and green == 0.0 and blue == 0.0:  # most rays end before the background
             continue
         a, b, c, d, x, y, _, _, _ = _place(texels, height, frame, directions_world[r])
         for texel, weight in (

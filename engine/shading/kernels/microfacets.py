@@ -40,13 +40,15 @@ def sample_visible_normal(
     o_x: float, o_y: float, o_z: float, alpha: float, u: float, v: float
 ) -> tuple[float, float, float]:
     """Return a normal of GGX as it is seen from ``o`` (o_z > 0)."""
+    # to the hemisphere configuration: stretched by alpha
     x, y, z = alpha * o_x, alpha * o_y, o_z
     length = math.sqrt(x * x + y * y + z * z)
     x, y, z = x / length, y / length, z / length
-    height = (1.0 - u) * (1.0 + z) - z
+    height = (1.0 - u) * (1.0 + z) - z  # a point on the cap of the sphere seen from there, evenly
     radius = math.sqrt(min(max(1.0 - height * height, 0.0), 1.0))
     angle = 2.0 * math.pi * v
     h_x, h_y, h_z = radius * math.cos(angle) + x, radius * math.sin(angle) + y, height + z
+    # back to normals of the stretched surface
     h_x, h_y, h_z = alpha * h_x, alpha * h_y, max(h_z, 1e-9)
     length = math.sqrt(h_x * h_x + h_y * h_y + h_z * h_z)
     return h_x / length, h_y / length, h_z / length

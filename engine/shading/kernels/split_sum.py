@@ -109,14 +109,14 @@ def integrate_table(first: int, last: int, samples: int, table: Float64[np.ndarr
         o_x = math.sqrt(max(1.0 - o_z * o_z, 0.0))
         scale = bias = 0.0
         for k in range(samples):
-            v, half, bits = 0.0, 0.5, k
+            v, half, bits = 0.0, 0.5, k  # radical inverse in base 2, the second Hammersley coordinate
             while bits > 0:
                 v += half * (bits & 1)
                 bits >>= 1
                 half *= 0.5
             h_x, _, h_z = sample_visible_normal(o_x, 0.0, o_z, alpha, (k + 0.5) / samples, v)
             cos_d = o_x * h_x + o_z * h_z
-            i_z = 2.0 * cos_d * h_z - o_z
+            i_z = 2.0 * cos_d * h_z - o_z  # o reflected at h; below the surface nothing is sent back
             if i_z > 0.0:
                 masking = ggx_masking(i_z, alpha)
                 weight = schlick_weight(cos_d)
@@ -191,7 +191,7 @@ def shade_pixel(
     texels, offsets, heights, roughnesses = light.texels, light.offsets, light.heights, light.roughnesses
     n_x, n_y, n_z = normal[p, 0], normal[p, 1], normal[p, 2]
     cosine = -(direction[p, 0] * n_x + direction[p, 1] * n_y + direction[p, 2] * n_z)
-    r_x = direction[p, 0] + 2.0 * cosine * n_x
+    r_x = direction[p, 0] + 2.0 * cosine * n_x  # R = d + 2 (N.V) N, with V = -d
     r_y = direction[p, 1] + 2.0 * cosine * n_y
     r_z = direction[p, 2] + 2.0 * cosine * n_z
     metallic, roughness = material[p, 3], material[p, 4]
@@ -312,6 +312,7 @@ def backward_pixel(p: int, backward: ShadeBackward) -> None:
         grad_factor = gradient * specular_light
         grad_cosine += grad_factor * (f0 * grad_scale_cosine + grad_bias_cosine)
         grad_roughness += grad_factor * (f0 * grad_scale_roughness + grad_bias_roughness)
+        # through the mix of two levels of the lobe
         grad_roughness += gradient * factor * visibility[p] * (blurred - sharp) * grad_between
         grad_visibility += gradient * factor * around
         grad_ambient += gradient * diffuse_albedo * irradiance
@@ -329,9 +330,9 @@ def backward_pixel(p: int, backward: ShadeBackward) -> None:
         grad_n_y += share * s_y
         grad_n_z += share * s_z
     # --- the rest of the gradients ---
-    if cosine < LEAST_COSINE:
+    if cosine < LEAST_COSINE:  # clamped cosines have no slope
         grad_cosine = 0.0
-    along = n_x * grad_r_x + n_y * grad_r_y + n_z * grad_r_z
+    along = n_x * grad_r_x + n_y * grad_r_y + n_z * grad_r_z  # dR/dN: R = d - 2 <d, N> N
     out.reflected[p, 0] = 2.0 * (cosine * grad_r_x - along * d_x)
     out.reflected[p, 1] = 2.0 * (cosine * grad_r_y - along * d_y)
     out.reflected[p, 2] = 2.0 * (cosine * grad_r_z - along * d_z)
@@ -361,7 +362,7 @@ def add_to_texels(
     for p in range(len(taps)):
         for k in range(TAPS):
             weight = weights[p, k]
-            if weight == 0.0:
+            if weight == 0.0:  # levels that had no share
                 continue
             texel = taps[p, k]
             for channel in range(3):

@@ -48,17 +48,21 @@ class ArrayPool:
         sizes = [math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in specs]
         ends = list(accumulate(-(-size // CACHE_LINE_BYTES) * CACHE_LINE_BYTES for size in sizes))
         size = ends[-1]
+        # at most four times too large, so that small arrays do not hold large blocks
         fitting = [block for block in self._free if size <= block.nbytes <= 4 * size]
         if fitting:
             block = min(fitting, key=lambda block: block.nbytes)
             self._free = [other for other in self._free if other is not block]
         else:
+            # a quarter more, for the somewhat larger requests that follow
             block = _aligned_bytes(size + size // 4)
         lease = _BlockLease(block)
+        # at exit nothing is reused
         weakref.finalize(lease, _return_block, weakref.ref(self), block).atexit = False
         held = np.asarray(lease)
         return [
             held[begin : begin + size].view(dtype).reshape(shape)
+            # the last of the begins is the end of all
             for begin, size, (shape, dtype) in zip([0, *ends], sizes, specs, strict=False)
         ]
 

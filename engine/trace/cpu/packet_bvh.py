@@ -46,8 +46,10 @@ class PacketBvh:
         low, cell = _curve_grid(primitives[:, :3])
         run_ranges(morton_keys, threads, count, primitives, low, 1.0 / cell, keys)
         order, sorted_keys = stable_argsort(keys, KEY_BITS, threads)
+        # keys of Gaussians that are not finite are the largest: these come last, and are cut off
         order = order[: int(np.searchsorted(sorted_keys, INVALID_KEY))]
         blocks = -(-len(order) // WIDTH)
+        # --- sizes of the levels, from the blocks' boxes up to a single node ---
         sizes = [max(1, -(-blocks // WIDTH))]
         while sizes[-1] > 1:
             sizes.append(-(-sizes[-1] // WIDTH))
@@ -81,6 +83,7 @@ def _curve_grid(means_world: Float32[np.ndarray, "n 3"]) -> tuple[np.ndarray, fl
     sample = sample[np.isfinite(sample).all(axis=1)]
     if len(sample) == 0:
         return np.zeros(3), 1.0
+    # quantiles: a few means far away must not make the cells coarse
     low, high = np.quantile(sample, [0.01, 0.99], axis=0)
     size = max(float((high - low).max()), 1e-30)
     return low - 0.25 * size, 1.5 * size / MAX_CELL

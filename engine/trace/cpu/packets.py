@@ -114,6 +114,7 @@ class PacketTracer:
         self, packets: Int64[np.ndarray, "p 2"], rays: int, *, is_recording: bool
     ) -> PacketHits:
         """Return buffers for the recorded hits of packets."""
+        # without a recording nothing is stored
         places = rays * (self._limits.max_hits + HIT_PADDING) if is_recording and len(packets) else 0
         numbers, whole = ((places,), np.float32), ((places,), np.int32)
         us, vs, slots, slot_ids, slot_rgb = self._pool.empty(
@@ -191,6 +192,7 @@ class PacketTracer:
         """
         packet_hits, scene = recording.packet_hits, backward.scene
         counts = packet_hits.counts if isinstance(packet_hits, SharedSortHits) else packet_hits.slot_counts
+        # rows of packet p begin at firsts[p]: one for each Gaussian that it met
         firsts = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
         count, basis_count, feature_count = int(firsts[-1]), scene.sh.shape[1], scene.features.shape[1]
         geometry = GEOMETRY_WORDS if backward.output_gradients.has_geometry else 0
@@ -225,6 +227,7 @@ class PacketTracer:
         )
         met = np.empty(len(gaussian_segments.starts) - 1, np.float32)
         run_ranges(reduce_weights, self._threads, len(met), gaussian_segments, rows.weights, met)
+        # weights alone are summed first: most Gaussians of small weight need no gradient
         which = np.flatnonzero(met >= min_blend_weight)
         out = empty_gradients(len(which), basis_count, feature_count)
         run_on_threads(

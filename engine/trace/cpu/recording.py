@@ -41,7 +41,7 @@ class CpuRecording:
 
     def ids_of_ray(self, ray: int) -> Int32[np.ndarray, " k"]:
         """Return the ids of one ray's Gaussians, front to back."""
-        packet = int(np.searchsorted(self.packets[:, 0], ray, side="right")) - 1
+        packet = int(np.searchsorted(self.packets[:, 0], ray, side="right")) - 1  # packets ascend
         if packet < 0 or ray >= self.packets[packet, 1]:
             return self.hits.ids[self.hit_slice(ray)]
         if isinstance(self.packet_hits, SharedSortHits):
@@ -50,6 +50,7 @@ class CpuRecording:
             return self.packet_hits.ids[place][
                 (self.packet_hits.ray_masks[place] >> bit & np.uint64(1)).astype(bool)
             ]
+        # the kernels' formula, not compiled for these types
         first = first_hit_index.py_func(int(self.packets[packet, 0]), self.limits)
         return self.packet_hits.slot_ids[first + self.packet_hits.slots[self.hit_slice(ray)]]
 

@@ -54,6 +54,7 @@ class SingleRayTracer:
         self._quality = build_quality
         self._device = EmbreeDevice(threads)
         self._bvh: EmbreeBoxScene | None = None
+        # rows of whole cache lines, so that threads do not write to the same one
         self._scratch = aligned_empty((MAX_CHUNKS, -(-SCRATCH_WORDS // 16) * 16))
         # RTCIntersectArguments: flags and feature mask, then the context of each chunk's own scratch row.
         self._arguments = np.zeros((MAX_CHUNKS, 8), np.uint64)
@@ -113,6 +114,7 @@ class SingleRayTracer:
         )
         starts = gaussian_segments.starts
         segments = len(starts) - 1
+        # about as many hits a chunk, cut where the next Gaussian begins
         places = np.linspace(0, total, REDUCE_CHUNKS_PER_THREAD * self._threads + 1).astype(np.int64)
         bounds = np.searchsorted(starts, places)
         bounds[0], bounds[-1] = 0, segments

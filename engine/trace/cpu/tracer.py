@@ -46,7 +46,7 @@ from octasplat.engine.trace.protocol import (
     TraceSettings,
 )
 
-MAX_RAYS_PER_TRACE = 1 << 28
+MAX_RAYS_PER_TRACE = 1 << 28  # a hit's ray number has 28 bits in single_backward
 
 
 class CpuTracer:
@@ -98,7 +98,7 @@ class CpuTracer:
         self._features = np.empty((0, 0), np.float32)
         self._primitives = aligned_empty((0, PRIMITIVE_WORDS))
         self._boxes = np.empty((0, 6), np.float32)
-        self._build_id = object()
+        self._build_id = object()  # compared by identity: a recording belongs to one build
 
     def build(self, gaussians: FlatGaussians, features: Float32[np.ndarray, "n f"] | None = None) -> None:
         """Build the hierarchy around ``gaussians``, which are kept by reference."""
@@ -119,7 +119,7 @@ class CpuTracer:
         )
         if self._packet_mode != "never":
             self._packet_tracer.build(self._primitives)
-        self._is_single_built = False
+        self._is_single_built = False  # built when the first single ray asks for it
         self._build_id = object()
 
     def refresh(self, ids: Int32[np.ndarray, " u"] | None = None) -> None:
@@ -138,6 +138,7 @@ class CpuTracer:
                 refit_outgrown_boxes, self.threads, len(ids),
                 outgrown, self._boxes, ids, parameters, q, self._padding,
             )  # fmt: skip
+            # a box that has changed is not in Embree's hierarchy yet
             self._is_single_built = not outgrown.any()
 
     def trace(self, rays: RayBatch, *, record: bool = False) -> TraceResult:
@@ -146,6 +147,7 @@ class CpuTracer:
         count = len(rays)
         result = empty_result(count, self._features.shape[1])
         in_one_order = len(packets) > 0 and self._uses_shared_sort
+        # a shared order keeps hits of its own
         hits = self._allocate_hits(count if record and not (in_one_order and len(alone) == 0) else 0)
         forward = ForwardPass(
             rays=RayArrays.from_batch(rays),
@@ -210,6 +212,7 @@ class CpuTracer:
             return self._packet_tracer.backward(recording, backward, min_blend_weight)
         parts = []
         if len(recording.packets):
+            # only the sum over both parts is compared with the least weight
             parts.append(self._packet_tracer.backward(recording, backward, 0.0))
         parts.append(self._single_tracer.backward(recording, backward))
         return drop_low_weight(add_gradients(parts), min_blend_weight)

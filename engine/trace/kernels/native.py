@@ -137,6 +137,7 @@ def atomic_fetch_add(typingctx: TypingContext, address: Address, count: int) -> 
         context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
     ) -> ir.Value:
         pointer = builder.inttoptr(args[0], ir.IntType(64).as_pointer())
+        # only the numbers must differ: no other memory is ordered by them
         return builder.atomic_rmw("add", pointer, args[1], "monotonic")
 
     return signature, codegen
@@ -160,6 +161,7 @@ def prefetch(typingctx: TypingContext, address: Address) -> Intrinsic:
         i32 = ir.IntType(32)
         function_type = ir.FunctionType(ir.VoidType(), [pointer, i32, i32, i32])
         function = cgutils.get_or_insert_function(builder.module, function_type, "llvm.prefetch.p0")
+        # to be read, kept in all levels of the data cache
         hint = [ir.Constant(i32, 0), ir.Constant(i32, 3), ir.Constant(i32, 1)]
         builder.call(function, [builder.inttoptr(args[0], pointer), *hint])
         return context.get_dummy_value()

@@ -64,7 +64,7 @@ def _query_rays8(
     words = scratch.view(np.int32)
     # --- the rays, a lane each ---
     for lane in range(LANES):
-        lane_row = min(row + lane, end - 1)
+        lane_row = min(row + lane, end - 1)  # lanes beyond the end repeat the last ray, but are not valid
         r = rays.ray_indices[lane_row] if len(rays.ray_indices) else lane_row
         o = r if len(rays.origins) > 1 else 0
         for axis in range(3):
@@ -133,7 +133,7 @@ def any_hits(
     for k in range(first, last, LANES):
         _query_rays8(query, rays, k, last, False, scratch)
         for lane in range(min(LANES, last - k)):
-            occluded[k + lane] = scratch[T_FAR * LANES + lane] == -np.inf
+            occluded[k + lane] = scratch[T_FAR * LANES + lane] == -np.inf  # Embree's sign for a hit
 
 
 @kernel(_nrt=False, error_model="numpy")

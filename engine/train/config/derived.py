@@ -50,7 +50,7 @@ def iteration_count(config: TrainConfig, training_pixels: int, valid_fraction: f
         min_thousands = MIN_THOUSANDS * max(1, rays_per_pixel // RAYS_PER_MIN_THOUSANDS)
     thousands = max(round(rays_per_pixel * training_pixels / config.rays_per_batch / 1000), min_thousands)
     if not config.materials.learn:
-        thousands = round(thousands / valid_fraction)
+        thousands = round(thousands / valid_fraction)  # rays that show nothing cost next to no time
     max_thousands = MAX_ITERATIONS // 1000 * rays_per_pixel // MAX_ITERATIONS_RAYS
     return config.iterations or min(thousands, max_thousands) * 1000
 

@@ -108,6 +108,7 @@ class LearningRates(Settings):
         if self.scale_after == 0 or iterations <= self.scale_after:
             return self
         share = math.sqrt(self.scale_after / iterations)
+        # never below the last step, to which it falls
         mean = min(self.mean, max(share * self.mean, self.mean_final))
         return self.model_copy(update={"mean": mean, "quat": share * self.quat})
 

@@ -74,7 +74,7 @@ class McmcDensifier:
         if not self.wants_errors:
             return
         if len(self._errors) != count:
-            self._reset_sums(count)
+            self._reset_sums(count)  # other Gaussians than before: nothing is known of these
         self._errors[gradients.ids] += gradients.error_sums
         self._weights[gradients.ids] += gradients.weight_sums
 
@@ -104,6 +104,7 @@ class McmcDensifier:
         wanted = len(dead) + born
         if wanted == 0 or score.sum() <= 0:
             return gaussians, adam
+        # with replacement: several copies may go to one place
         chosen = rng.choice(count, size=wanted, p=score / score.sum())
         sources, made = self._make_copies(gaussians, chosen, config.copies == "area", rng)
         adam.reset(sources)
@@ -111,7 +112,7 @@ class McmcDensifier:
         adam.reset(dead)
         if born == 0:
             return gaussians, adam
-        new = made.select(np.arange(len(dead), wanted))
+        new = made.select(np.arange(len(dead), wanted))  # the first of those made take the rows of the dead
         self._reset_sums(count + born)
         return concatenate([gaussians, new]), adam.append(Adam.zeros(new))
 
@@ -146,14 +147,18 @@ class McmcDensifier:
         sources = np.flatnonzero(copies > 1)
         scales = gaussians.scales[chosen]
         if area:
+            # area falls by the number of copies, standard deviations by its root
             shrunk = -0.5 * np.log(copies[sources])
         else:
+            # neither logarithm nor division by zero
             a = np.clip(gaussians.opacities[sources].astype(np.float64), 1e-4, 1 - 1e-4)
+            # copies are not dead at once
             new_a = np.maximum(split_opacity(a, copies[sources]), self._config.dead_opacity * 1.5)
             gaussians.opacity_logits[sources] = np.log(new_a / (1 - new_a))
             shrunk = np.log(split_scale_factor(a, copies[sources]))
         gaussians.log_scales[sources] += shrunk[:, None].astype(np.float32)
         made = gaussians.select(chosen)
+        # within the old ellipse where they share its area, else within the shrunk one
         spread = rng.standard_normal((len(chosen), 2)) * (scales if area else made.scales)
         made.means_world += np.einsum("nij,nj->ni", made.rotations[:, :, 1:], spread).astype(np.float32)
         return sources, made

@@ -60,6 +60,7 @@ class NormalPropagation:
         iteration = self._iteration
         if self._inner.is_due(iteration):
             gaussians, adam = self._inner.apply(gaussians, adam, rng, extent=extent)
+        # a Gaussian needs that many others around it
         if self._is_due(iteration) and len(gaussians) > NEIGHBOURS:
             self._propagate(gaussians, rng, training_progress=iteration / self._total)
         return gaussians, adam

@@ -57,9 +57,10 @@ class RedisplatsDensifier:
         large = size[chosen] > config.split_scale * extent
         split, clone = chosen[large], chosen[~large]
         clones = gaussians.select(clone)
-        clones.means_world -= self._steps[clone]
+        clones.means_world -= self._steps[clone]  # back to before the step, while the original keeps it
         halves = gaussians.select(split)
         axes = halves.rotations[:, :, 1:] * halves.scales[:, None, :]
+        # both halves are drawn from the Gaussian's own distribution
         for target in (gaussians.means_world, halves.means_world):
             index = split if target is gaussians.means_world else slice(None)
             offset = np.einsum("nij,nj->ni", axes, rng.standard_normal((len(split), 2)))

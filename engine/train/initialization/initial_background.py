@@ -90,6 +90,7 @@ def _texel_directions(background: LearnedBackground) -> Float64[np.ndarray, "t 3
     height, width = background.rgb_srgb.shape[:2]
     polar = np.pi * (np.arange(height)[:, None] + 0.5) / height
     azimuth = 2 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)
+    # 0 * azimuth gives it the shape of the grid
     parts = np.sin(polar) * np.sin(azimuth), np.cos(polar) + 0 * azimuth, np.sin(polar) * np.cos(azimuth)
     return np.asarray(
         sum(part.reshape(-1, 1) * axis for part, axis in zip(parts, background.frame, strict=True))
@@ -139,6 +140,7 @@ def _texel_medians(
     """Return the lower median of each channel of each texel's colors, and how many there are."""
     found = np.bincount(texel, minlength=count)
     medians = np.zeros((count, 3), np.float32)
+    # first of the texel, plus the lower middle of its count
     middle = np.cumsum(found) - found + np.maximum(found - 1, 0) // 2
     for channel in range(3):
         values = rgb[np.lexsort((rgb[:, channel], texel)), channel]
@@ -153,7 +155,7 @@ def _fill_unknown(
     if not known.any():
         return np.full_like(colors, 0.5)
     width = colors.shape[1]
-    around = np.tile(known, (1, 3))
+    around = np.tile(known, (1, 3))  # three maps side by side, so that distances go around
     row, column = distance_transform_edt(~around, return_distances=False, return_indices=True)
     nearest = colors[row, column % width][:, width : 2 * width]
     soft = gaussian_filter(nearest, (*BLUR_TEXELS, 0), mode=("nearest", "wrap", "nearest"))

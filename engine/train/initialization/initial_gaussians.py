@@ -91,6 +91,7 @@ def initial_gaussians(
     Raises:
         DatasetError: nothing says where Gaussians could begin.
     """
+    # a stream of its own: 0 is the training's, 1 the probe's
     rng = np.random.Generator(np.random.PCG64([options.seed, 2]))
     points, limit = dataset.points, options.max_count
     if len(points.xyz_world) >= MIN_POINTS:
@@ -118,6 +119,7 @@ def initial_gaussians(
             plane_points=options.normal_neighbors,
             most_angles=max_angles,
         )
+    # --- too few sparse points: random pixels at random depths ---
     view, y, x = dataset.sample_pixels(rng, limit)
     rays = dataset.rays(view, y, x)
     rgb, alpha, weight = dataset.pixels(view, y, x)
@@ -187,7 +189,7 @@ def gaussians_from_points(
     centre = np.median(camera_centres_world, axis=0)
     far = np.linalg.norm(xyz_world - centre, axis=1) > MAX_DISTANCE * extent
     keep = np.flatnonzero(~far & np.isfinite(xyz_world).all(axis=1))
-    if len(keep) > limit:
+    if len(keep) > limit:  # points that are matching errors should not take the place of others
         keep = np.sort(rng.choice(keep, limit, replace=False))
     points = xyz_world[keep].astype(np.float64)
     count = len(points)
@@ -204,6 +206,7 @@ def gaussians_from_points(
     )
     nearest = distances[:, 1 : NEIGHBOURS + 1] if neighbor_count > 1 else np.full((count, 1), 0.01 * extent)
     spacing = nearest.mean(axis=1)
+    # neither vanishing nor wider than a fifth of the distance scale
     spacing = np.clip(
         spacing, 1e-5 * extent, 0.2 * extent * np.maximum(1.0, _distances_from(points, centre) / extent)
     )
@@ -211,11 +214,12 @@ def gaussians_from_points(
     to_camera = cKDTree(camera_centres_world).query(points)[0]
     max_angles = MAX_ANGULAR_SIZE if most_angles is None else most_angles[keep]
     spacing = np.minimum(spacing, np.maximum(max_angles * to_camera, 1e-5 * extent))
-    normals = _normalize_or_z_axis(centre - points)
+    normals = _normalize_or_z_axis(centre - points)  # facing the cameras, where no plane is found
     if neighbor_count == plane_points + 1:
         neighborhoods = points[neighbours]
         neighborhoods = neighborhoods - neighborhoods.mean(axis=1, keepdims=True)
         values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", neighborhoods, neighborhoods))
+        # the least spread is small against the next: the points lie on a plane
         planar = values[:, 0] < 0.1 * values[:, 1]
         normals[planar] = vectors[planar, :, 0]
     return _assemble(points, normals, spacing, rgb_srgb[keep], opacity)

@@ -70,6 +70,7 @@ def draw_patches(
     rays = dataset.rays(view_ids, all_y.reshape(-1), all_x.reshape(-1))
     origins, directions = rays.origins_world, rays.directions_world
     rgb, alpha, weight = photographs.pixels(view_ids, all_y.reshape(-1), all_x.reshape(-1))
+    # a patch across the edge of a mask would match that edge
     is_valid = ((weight > 0) & (alpha > 0.5)).reshape(all_y.shape).all(axis=1)
     directions = directions.astype(np.float64).reshape(*all_y.shape, 3)
     # Distance along a ray of a point at depth 1 along the camera's axis.
@@ -95,6 +96,7 @@ def patch_cost(
     distances = depths[:, None] * patches.depth_factors
     points = patches.origin_world + distances[:, :, None] * patches.directions_world
     count, offsets = distances.shape
+    # infinite where the other view does not show the whole patch
     costs = np.full((len(neighbours), count), np.inf)
     for k, other in enumerate(neighbours):
         image_px, depth = project(dataset, other, points.reshape(-1, 3))
@@ -107,7 +109,7 @@ def patch_cost(
         differences = np.empty(len(inside))
         patch_differences(patches.rgb_srgb, rgb.reshape(-1, offsets, 3), inside, LEVEL_WEIGHT, differences)
         costs[k, inside] = differences
-    costs.sort(axis=0)
+    costs.sort(axis=0)  # the better half counts: in the others the patch may be hidden
     used = costs[: max(1, (len(neighbours) + 1) // 2)]
     return np.asarray(used.mean(axis=0))
 

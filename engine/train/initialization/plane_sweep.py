@@ -163,8 +163,10 @@ def _neighbouring_views(dataset: Dataset, points: Float64[np.ndarray, "n 3"]) ->
                 observed_distances[index] * OBSERVED_SPAN,
             )
         baseline = BASELINE * scene_distance
+        # views from one place tell no depth
         usable = (axes @ axes[k] > MIN_VIEW_COSINE) & (distance > 0.1 * baseline)
         baseline_error = np.abs(np.log(np.maximum(distance, 1e-12) / max(baseline, 1e-12)))
+        # stable, so that equal views are chosen alike everywhere
         order = np.argsort(np.where(usable, baseline_error, np.inf), kind="stable")
         result[index] = [train[j] for j in order[:NEIGHBOURS] if usable[j]]
     return result
@@ -216,13 +218,14 @@ def _lift_pixels(
     distances_px, nearest = cKDTree(projected_px[inside]).query(pixels_px, DEPTH_HYPOTHESES)
     suggested = depths[inside][nearest]
     depth, cost = _best_hypothesis(suggested, _hypothesis_costs(photographs, patches, suggested, neighbours))
+    # --- badly matched pixels: depths that no point suggests ---
     doubtful = np.flatnonzero(cost > MAX_AMBIGUOUS_COST)
     more = _trial_depths(depths[inside], len(doubtful), rng)
     more_costs = _hypothesis_costs(photographs, patches[doubtful], more, neighbours)
     other, other_cost = _best_hypothesis(more, more_costs)
     swept = np.zeros(len(depth), np.bool_)
     swept[doubtful] = other_cost < MAX_RIVALRY * np.minimum(cost[doubtful], MAX_COST)
-    chosen = swept[doubtful]
+    chosen = swept[doubtful]  # among the doubtful ones
     is_kept = cost < MAX_COST
     is_kept[swept] = other[chosen] < OCCLUSION_FACTOR * depth[swept]
     depth[swept], cost[swept] = other[chosen], other_cost[chosen]
@@ -232,6 +235,7 @@ def _lift_pixels(
     depth[is_unmatched] = _interpolate_depths(suggested[is_unmatched], distances_px[is_unmatched])
     is_kept |= is_unmatched
     if background is not None:
+        # --- pixels that match at infinity: the background ---
         at_infinity = patch_cost(
             photographs, patches, np.full(len(depth), BACKGROUND_DEPTH * depth.max()), neighbours
         )
@@ -264,6 +268,7 @@ def _best_hypothesis(
 def _cost_ratio(costs: Float64[np.ndarray, "n g"]) -> Float64[np.ndarray, " n"]:
     """Return the least cost over the next that is more than one step away; depths are in order."""
     best = np.argmin(costs, axis=1)[:, None]
+    # neighboring depths are moved versions of the same match
     is_neighbor = np.abs(np.arange(costs.shape[1]) - best) <= 1
     return np.asarray(costs.min(axis=1) / np.maximum(np.where(is_neighbor, np.inf, costs).min(axis=1), 1e-12))
 

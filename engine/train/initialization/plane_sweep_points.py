@@ -102,5 +102,6 @@ def _count_confirmations(
     near = cKDTree(xyz_world).query_ball_point(xyz_world, SAME_POINT * seen.distance)
     mine = np.repeat(np.arange(len(near)), [len(others) for others in near])
     views = seen.view[np.concatenate(near).astype(np.int64)]
+    # each other view counts once
     pairs = np.unique(np.stack([mine, views], axis=1)[views != seen.view[mine]], axis=0)
     return np.bincount(pairs[:, 0], minlength=len(near))

@@ -44,12 +44,13 @@ def passes_vote(
         return ids, np.abs(rgb - points.rgb_srgb[ids]).mean(axis=1) < limits[ids]
 
     jury = train[np.unique(np.linspace(0, len(train) - 1, VOTING_VIEWS).astype(np.int64))].tolist()
+    # the pool keeps the order: sums are the same on any number of threads
     for ids, agrees in pool.map(vote, [(index, slice(None)) for index in jury]):
         looking[ids] += 1
         agree[ids] += agrees
     if len(jury) < len(train):
         unseen = np.flatnonzero(looking < MIN_VOTERS)
-        looking[unseen] = agree[unseen] = 0
+        looking[unseen] = agree[unseen] = 0  # of these only their nearest views vote
         for ids, agrees in pool.map(vote, _voting_views(dataset, own_view, unseen)):
             looking[ids] += 1
             agree[ids] += agrees

@@ -130,7 +130,8 @@ def _update(
     correction2: float,
 ) -> float:
     first, second, beta1, beta2, epsilon = moments
-    m = beta1 * np.float64(first[row, column]) + (1.0 - beta1) * gradient
+    m = beta1 * np.float64(first[row, column]) + (1.0 - beta1) * gradient  # m = beta1 m + (1 - beta1) g
+    # v = beta2 v + (1 - beta2) g^2
     v = beta2 * np.float64(second[row, column]) + (1.0 - beta2) * gradient * gradient
     first[row, column] = m
     second[row, column] = v
@@ -162,6 +163,7 @@ def own_axes_gradient(
     That is by d, where its quaternion is multiplied by (1, d).
     """
     w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
+    # the vector part of conj(q) times the gradient
     a, b, c, d = g_quats[k, 0], g_quats[k, 1], g_quats[k, 2], g_quats[k, 3]
     out[3] = 0.0
     out[4] = -a * x + b * w + c * z - d * y
@@ -176,6 +178,7 @@ def turn(i: int, quats: Float32[np.ndarray, "n 4"], by: Float32[np.ndarray, "16"
         np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3]),
     )  # fmt: skip
     a, b, c = np.float64(by[4]), np.float64(by[5]), np.float64(by[6])
+    # both lengths at once: of the quaternion and of (1, d)
     share = 1.0 / math.sqrt((w * w + x * x + y * y + z * z) * (1.0 + a * a + b * b + c * c))
     quats[i, 0] = (w - x * a - y * b - z * c) * share
     quats[i, 1] = (x + w * a + y * c - z * b) * share
@@ -226,6 +229,7 @@ def step_gaussian(
     # --- values, gradients and rates of the geometry, a row each ---
     values, g_values, value_rates, axes = room[0], room[1], room[2], room[3:6]
     few_at = room[6:].ctypes.data
+    # scales before the step: the regularizer and the unit of the mean's step use them
     scale_0, scale_1 = math.exp(np.float64(log_scales[i, 0])), math.exp(np.float64(log_scales[i, 1]))
     rate = rates.mean
     if rates.mean_by_size:
@@ -252,7 +256,7 @@ def step_gaussian(
     if regular.opacity_weight != 0.0:
         opacity = 1.0 / (1.0 + math.exp(-np.float64(logits[i])))
     values[9], value_rates[9] = logits[i], rates.opacity
-    g_values[9] = g_logits[k] + regular.opacity_weight * opacity * (1.0 - opacity)
+    g_values[9] = g_logits[k] + regular.opacity_weight * opacity * (1.0 - opacity)  # d opacity / d logit
     first_at = moments.first.ctypes.data + i * moments.first.shape[1] * 4
     second_at = moments.second.ctypes.data + i * moments.second.shape[1] * 4
     values_at, g_values_at, value_rates_at = values.ctypes.data, g_values.ctypes.data, value_rates.ctypes.data
@@ -337,8 +341,9 @@ def adam_shares(
         i = ids[k]
         c1, c2 = corrections[k, 0], corrections[k, 1]
         for place in range(values.shape[1]):
+            # a logit of exactly 0 or 1 would be infinite
             value = min(max(np.float64(values[i, place]), LEAST_SHARE), 1.0 - LEAST_SHARE)
-            gradient = np.float64(g_values[k, place]) * value * (1.0 - value)
+            gradient = np.float64(g_values[k, place]) * value * (1.0 - value)  # by the logit
             logit = _update(
                 math.log(value / (1.0 - value)), gradient, moments, i, column + place, rate, c1, c2
             )

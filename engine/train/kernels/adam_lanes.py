@@ -57,6 +57,7 @@ def step_lanes(
         value, gradient, rate, m, v = (builder.load(at, align=4) for at in places)
         m = builder.fadd(times(beta1, m), times(rest1, gradient), flags=("contract",))
         v = builder.fadd(times(beta2, v), times(times(rest2, gradient), gradient), flags=("contract",))
+        # m and v without the bias of their zero start
         below = builder.fadd(builder.call(root, [times(v, correction2)]), epsilon)
         step = builder.fdiv(times(rate, times(m, correction1)), below)
         for found, at in ((builder.fsub(value, step), 0), (m, 3), (v, 4)):

@@ -35,6 +35,7 @@ def _part(first: int, last: int, terms: PixelTerms, sums: Float64[np.ndarray, "2
             difference = render[r, channel] - target[r, channel]
             absolute += abs(difference) * weight[r]
             squared += difference * difference * weight[r]
+            # d |d| / d render is the sign, 0 at 0
             slope = l2 * difference
             if difference > np.float32(0.0):
                 slope += l1

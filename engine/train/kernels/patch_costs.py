@@ -24,6 +24,7 @@ def patch_differences(
         row = rows[k]
         texture = level = 0.0
         for c in range(3):
+            # the mean difference is exposure or shading, the rest is texture
             mean = 0.0
             for p in range(pixels):
                 mean += np.float64(theirs[k, p, c]) - np.float64(ours[row, p, c])

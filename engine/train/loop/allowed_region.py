@@ -34,6 +34,7 @@ class AllowedRegion:
         ``state`` changes in place: their opacity, their moments, and the count of those near to cameras.
         """
         is_near, is_outside = self._prune_masks(state.gaussians, 1.0)
+        # those hidden before are not counted again
         is_outside &= state.gaussians.opacity_logits > PRUNED_LOGIT
         state.pruned_near_cameras += int((is_near & is_outside).sum())
         rows = np.flatnonzero(is_outside)

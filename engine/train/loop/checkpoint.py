@@ -38,6 +38,7 @@ _DAMAGE = (
 
 def run_fingerprint(dataset: Dataset, config: TrainConfig) -> str:
     """Return a digest of the settings and the photographs that decide every byte of a training."""
+    # settings under their former names, so that older checkpoints keep their digest
     text = json.dumps([dump_with_former_settings(config), dataset.views_record.fingerprint()])
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -68,7 +69,7 @@ def save_checkpoint(state: TrainState, folder: Path, fingerprint: str) -> Path:
         "rng": state.rng.bit_generator.state,
         "seconds": state.seconds,
         "running_mse": state.running_mse,
-        "best_psnr": state.best_psnr if np.isfinite(state.best_psnr) else None,
+        "best_psnr": state.best_psnr if np.isfinite(state.best_psnr) else None,  # JSON has no infinity
         "best_iteration": state.best_iteration,
         # Keys of former versions, whose checkpoints are read.
         "left_out": state.excluded_views.tolist(),
@@ -87,7 +88,7 @@ def save_checkpoint(state: TrainState, folder: Path, fingerprint: str) -> Path:
     arrays |= {f"shading.{name}": value for name, value in state.shading.items()}
     if len(state.pose_corrections):
         arrays["poses.corrections"] = state.pose_corrections
-    meta["arrays"] = sorted(arrays)
+    meta["arrays"] = sorted(arrays)  # listed, so that a missing array is noticed
     with atomic_replace(path) as temporary:
         np.savez(temporary, meta=np.array(json.dumps(meta)), **arrays)
     for partial in folder.glob(".*.partial.npz"):  # of runs that were killed while they wrote

@@ -83,6 +83,7 @@ def loss_and_gradients(
     shaded = shading.shade(traced)
     render = shaded.composite_over(batch.background_srgb)
     loss = batch_loss(render, batch, weights)
+    # render = rgb + T background, so that dL/dT = <dL/drender, background>
     grad = ShadedRayGradients(loss.gradient, loss.gradient @ batch.background_srgb)
     grad_shading = shading.backward(traced, shaded, grad)
     grad_trace = grad_shading.trace
@@ -150,10 +151,12 @@ def train_step(
     moved = state.adam.step(
         state.gaussians, gradients, lr, loss, training_progress=training_progress, extent=extent
     )
+    # also writes the materials that the tracer holds as features
     shading.step(ShadingStep(state.gaussians, gradients, step_gradients.shading, training_progress))
     tracer.refresh(gradients.ids)
     densifier.observe(len(state.gaussians), gradients, moved)
     state.iteration += 1
+    # a plain mean at first, as there is no past to smooth with
     keep = min(MSE_SMOOTHING, 1 - 1 / state.iteration)
     state.running_mse = keep * state.running_mse + (1 - keep) * step_gradients.loss.squared_error
     return step_gradients

@@ -94,7 +94,7 @@ class Schedule:
     def is_validation_due(self, done: int) -> bool:
         """Return whether the state after ``done`` iterations is measured and saved as a checkpoint."""
         every = self.rebuild_every
-        every *= -(-self.checkpoint_every // every)
+        every *= -(-self.checkpoint_every // every)  # rounded up to whole rebuilds, where a run may stop
         return done % every == 0 or self.is_finished(done)
 
     def is_outlier_check_due(self, done: int) -> bool:
@@ -150,6 +150,7 @@ class Schedule:
     def training_progress(self, done: int) -> float:
         """Return the share of the training that is done: that of the iterations unless it ends early."""
         if self.early_stop_at is None:
+            # after the decision progress runs faster, so that it still ends at 1
             return done / self.iterations
         before = self.early_stop_at / self.planned_iterations
         return before + (1 - before) * (done - self.early_stop_at) / (self.iterations - self.early_stop_at)
@@ -205,4 +206,4 @@ class Stopwatch:
         self._kept_s, compiled_s = self.seconds, compilation_seconds()
         yield self._kept_s
         self._left_out_s += compilation_seconds() - compiled_s
-        self._since = time.perf_counter()
+        self._since = time.perf_counter()  # time in between is not counted

@@ -88,6 +88,7 @@ class MinScale:
 
     def apply(self, gaussians: FlatGaussians) -> None:
         """Raise the scales that are smaller, in place."""
+        # the nearest camera shows the finest detail
         distance = cKDTree(self.origins_world).query(gaussians.means_world)[0]
         least = np.log(np.maximum(self.angle_rad * distance, 1e-12)).astype(np.float32)
         np.maximum(gaussians.log_scales, least[:, None], out=gaussians.log_scales)

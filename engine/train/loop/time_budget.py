@@ -73,7 +73,7 @@ def choose_plan(
     seconds_unit = (
         seconds_an_iteration / gaussians**COST_POWER
     )  # an iteration takes one * count ** COST_POWER
-    gaussian_count = (
+    gaussian_count = (  # seconds = unit count^p iterations, with iterations in proportion to count
         (seconds / (seconds_unit * ITERATIONS_PER_GAUSSIAN)) ** (1 / (1 + COST_POWER)) if seconds > 0 else 0.0
     )
     count = min(max_gaussians, max(MIN_GAUSSIANS, round(gaussian_count)))

@@ -113,6 +113,7 @@ class Trainer:
         self._dataset = dataset
         self._batches = BatchSource(dataset, BatchOptions.from_config(config, dataset))
         pixels, valid = self._batches.sampler.pixel_count, valid_pixel_fraction(dataset)
+        # its length first: rates and the strategy depend on it
         self.schedule = Schedule.from_config(config, iteration_count(config, pixels, valid))
         rates = config.lr.scaled_for(self.schedule.iterations)
         self._config = config = config.model_copy(update={"lr": rates})
@@ -124,7 +125,7 @@ class Trainer:
         if config.materials.learn and config.materials.normal_propagation:
             propagate = material_shading(config.materials.recipe).propagate_normals
             densifier = NormalPropagation(densifier, propagate, iterations=self.schedule.iterations)
-        if state.early_stop_at is not None:
+        if state.early_stop_at is not None:  # decided before the checkpoint: resumed with the same end
             self.schedule = self.schedule.stop_early(state.early_stop_at)
         self.shading = shading or make_shading(
             ShadingOptions.from_config(config), len(dataset.views), dataset.extent
@@ -168,6 +169,7 @@ class Trainer:
         while True:
             schedule = self.schedule
             if schedule.is_finished(state.iteration) and state.average.gaussians is not None:
+                # the mean replaces the last state before it is measured
                 state.gaussians = state.average.gaussians
                 state.average.clear()
             if schedule.is_rebuild_due(state.iteration, len(state.gaussians)):
@@ -183,6 +185,7 @@ class Trainer:
                 return self._finish()
             components = self._components
             batch = batches.draw(state.rng, state.iteration)
+            # with one thread there is nobody to draw it meanwhile
             if self._threads != 1 and not self._uses_rng_or_stops(state.iteration + 1):
                 batches.prefetch(state.rng, state.iteration + 1)
             progress = schedule.training_progress(state.iteration)
@@ -192,6 +195,7 @@ class Trainer:
                 training_progress=progress, extent=self._extent,
             )  # fmt: skip
             is_stale = schedule.may_densify(state.iteration) and self._update_gaussians()
+            # rows belong to other Gaussians now
             if is_stale:
                 state.average.clear()
             elif schedule.is_averaging_due(state.iteration):
@@ -208,7 +212,7 @@ class Trainer:
         gaussians = self._probe.select_final(state, tracer, shading)
         gaussians = self._allowed_region.select_final(gaussians, state)
         if gaussians is not state.gaussians:
-            if self._pose_refiner is not None:
+            if self._pose_refiner is not None:  # the Gaussians of the best state belong to its poses
                 self._pose_refiner.dataset.set_corrections(state.pose_corrections)
             tracer.build(gaussians, shading.features(gaussians))
         estimate_untrained_exposures(self._dataset, self._background_srgb, tracer, shading)
@@ -256,7 +260,7 @@ class Trainer:
         state, tracer = self.state, self._components.tracer
         if self.schedule.is_orientation_due(state.iteration):
             flipped_ids = orient_normals(state.gaussians, self._dataset, self._dataset.train_indices, tracer)
-            state.adam.reset(flipped_ids)
+            state.adam.reset(flipped_ids)  # moments belong to the former axes
             tracer.refresh(flipped_ids)
 
     def _checkpoint_or_stop(self, watch: Stopwatch, *, resumed: bool) -> None:

@@ -148,10 +148,11 @@ def seconds_per_iteration(
         times.append(time.perf_counter())
 
     enough = WARM_UP_ITERATIONS + TIMED_ITERATIONS
+    # it is stopped long before its end, and nothing is added meanwhile
     trial = config.model_copy(
         update={"iterations": 100 * enough, "densify_from_iter": 100 * enough, "probe_rays": 256}
     )
-    state = initial_state(first.select(slice(None)), config.seed)
+    state = initial_state(first.select(slice(None)), config.seed)  # copied, as training changes them in place
     with suppress(CancelledError):
         _train(
             dataset=dataset,
@@ -163,6 +164,7 @@ def seconds_per_iteration(
         )
     if should_stop():
         raise CancelledError("Stopped before the training; the same command with --resume goes on.")
+    # mean pace after the warm-up
     return (times[-1] - times[WARM_UP_ITERATIONS - 1]) / (len(times) - WARM_UP_ITERATIONS)
 
 

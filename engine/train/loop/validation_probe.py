@@ -55,6 +55,7 @@ def draw_probe(
     """Draw ``count`` pixels of the views ``indices``."""
     view, y, x = PixelSampler(indices, view_sizes_px(dataset)).pixels(rng, count)
     rgb, alpha, weight = dataset.pixels(view, y, x)
+    # all masked out: nothing to average
     covered = float(np.average(alpha, weights=weight)) if weight.any() else 0.0
     return RayProbe(
         view=view,
@@ -142,7 +143,7 @@ class ValidationProbe:
             )
         estimate_untrained_exposures(self._dataset, self._background_srgb, tracer, shading)
         psnr, alpha = measure_probe(self._probe, self._dataset, tracer, shading)
-        if alpha < MIN_COVERAGE * self._probe.alpha and state.iteration > 0:
+        if alpha < MIN_COVERAGE * self._probe.alpha and state.iteration > 0:  # a first state may cover little
             raise TrainingError(
                 f"After iteration {state.iteration} the scene covers only {100 * alpha:.2g} % of the "
                 f"photographs, of which {100 * self._probe.alpha:.2g} % show something; nothing is exported. "

@@ -116,6 +116,7 @@ class Adam:
         vectors = -(-3 * gaussians.sh.shape[1] // LANES)
         rates_sh = np.full(vectors * LANES, color_rate * rates.sh_rest_ratio, np.float32)
         rates_sh[:3] = color_rate
+        # a power of two, so that the cached table is rarely made anew
         powers = _beta_powers(1 << (int(self.steps.max(initial=0)) + 1).bit_length())
         run_ranges(
             adam_step,
@@ -139,6 +140,7 @@ class Adam:
                     gradients.opacity_logits,
                     gradients.sh,
                 ),
+                # means fall from mean to mean_final in equal ratios
                 StepRates(
                     mean=mean_unit * rates.mean * (rates.mean_final / rates.mean) ** training_progress,
                     mean_by_size=rates.mean_unit == "size",
@@ -151,7 +153,7 @@ class Adam:
                 Regularization(
                     loss.opacity / hit_count,
                     loss.scale / (2 * hit_count * extent),
-                    float(np.log(1e-6 * extent)),
+                    float(np.log(1e-6 * extent)),  # scales between a millionth and ten times the extent
                     float(np.log(10.0 * extent)),
                 ),
                 mean_steps,

@@ -108,6 +108,7 @@ def _ssim_term(
     shape = (batch.ssim_patch_count, batch.patch_side, batch.patch_side, 3)
     weight = batch.weight[-count:, None]
     rendered = target[-count:]
+    # masked pixels take the photograph's color: no difference, no gradient
     mixed = render[-count:] * weight + rendered * (1 - weight)
     value, gradient = ssim_loss(mixed.reshape(shape), rendered.reshape(shape))
     return value, gradient.reshape(-1, 3) * weight

@@ -38,7 +38,7 @@ class WeightAverage:
             self.gaussians, self.count = now.copy(), 1
             return
         self.count += 1
-        share = np.float32(1.0 / self.count)
+        share = np.float32(1.0 / self.count)  # mean_k = mean_(k-1) + (now - mean_(k-1)) / k
         values = row_arrays(now)
         for name, mean in row_arrays(self.gaussians).items():
             flat, new = mean.reshape(-1), np.ascontiguousarray(values[name]).reshape(-1)

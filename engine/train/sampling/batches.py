@@ -188,6 +188,7 @@ class BatchSource:
                 f"{smallest} pixels wide or high; lower ssim_patch_side (16 at least), or set loss.ssim to 0."
             )
         count = min(
+            # no more patches than rays, whatever the share says
             round(options.rays_per_batch * options.ssim_patch_fraction / side**2),
             options.rays_per_batch // side**2,
         )
@@ -203,6 +204,7 @@ class BatchSource:
     def _background_colors(self, rng: np.random.Generator) -> Float32[np.ndarray, "3"]:
         name: Background = self._options.background
         if name == "auto":
+            # photographs with alpha show none: a random one keeps Gaussians from imitating it
             name = "random" if self._dataset.has_alpha else "black"
         if name == "random":
             return rng.random(3, dtype=np.float32)

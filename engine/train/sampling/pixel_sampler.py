@@ -80,6 +80,7 @@ class PixelSampler:
         self, rng: np.random.Generator, count: int
     ) -> tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]:
         """Draw ``count`` pixels as (view, y, x), repeated ones too, sorted by view and row."""
+        # sorted, so that neighboring rays read neighboring pixels
         flat = np.sort(rng.integers(0, self.pixel_count, count))
         view_rows = np.searchsorted(self._ends, flat, side="right")
         width, height = self._sizes[view_rows].T
@@ -127,6 +128,7 @@ class PixelSampler:
         columns = np.maximum(1, np.rint(width / side).astype(np.int64))
         rows = np.maximum(1, np.rint(height / side).astype(np.int64))
         row, column = np.divmod((share * columns * rows).astype(np.int64), columns)
+        # to and fro, so that neighbors along the way are neighbors in the view
         column = np.where(row % 2 == 1, columns - 1 - column, column)
         x = (column + rng.random(count)) * (width / columns)
         y = (row + rng.random(count)) * (height / rows)
@@ -137,6 +139,7 @@ class PixelSampler:
     ) -> tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]:
         """Draw ``count`` patches of ``side`` x ``side`` pixels inside the views: (view, y, x), row-major."""
         areas = np.diff(self._ends, prepend=0)
+        # patches by area: any pixel is about as likely
         view_rows = rng.choice(len(self._views), size=count, p=areas / areas.sum())
         width, height = self._sizes[view_rows].T
         left = rng.integers(0, width - side + 1)
@@ -172,7 +175,7 @@ def valid_pixel_fraction(dataset: TrainingData) -> float:
     view, y, x = sampler.pixels(np.random.Generator(np.random.PCG64(0)), VALID_PIXEL_SAMPLES)
     _, alpha, weight = dataset.pixels(view, y, x)
     valid_count = int(((alpha > 0) & (weight > 0)).sum())
-    if valid_count == 0 and _has_no_valid_pixel(dataset):
+    if valid_count == 0 and _has_no_valid_pixel(dataset):  # the sample may have missed the few valid ones
         raise DatasetError(
             "The training photographs show nothing: their masks or alpha leave no pixel. Masks are white "
             "where a pixel counts; invert them, or leave them out."

@@ -83,6 +83,7 @@ class VisibilityRays:
         own_cosines = np.einsum(
             "ki,kij,kj->k", direction, outer[row], direction
         )  # sum of squared cosines, itself 1
+        # sum of squared sines to the other rays of the track
         sharpness = np.sqrt(np.maximum(track[row] - own_cosines, 1e-12))
         pixel_rad = np.array([dataset.cameras[each.camera_index].pixel_angle_rad for each in dataset.views])[
             view
@@ -90,6 +91,7 @@ class VisibilityRays:
         error_px = np.maximum(points.errors_px[row], MIN_ERROR_PX)
         deviation = error_px * pixel_rad * distance / sharpness
         ends = distance - np.maximum(MAX_ERROR_SIGMAS * deviation, margin * distance)
+        # rays that end early are too uncertain to say anything
         is_usable = (track[row] >= MIN_TRACK_LENGTH) & (ends > 0.5 * distance)
         return cls(origins[view[is_usable]], direction[is_usable], ends[is_usable], view[is_usable])
 
@@ -117,5 +119,7 @@ def free_space_gradient(
     assert result.recording is not None
     no_color = np.zeros_like(result.rgb_srgb)
     return result.recording, TraceGradients(
-        no_color, transmittance=np.full(len(visibility_rays), -weight / len(visibility_rays), np.float32)
+        # dL/dT: hidden share is 1 - T
+        no_color,
+        transmittance=np.full(len(visibility_rays), -weight / len(visibility_rays), np.float32),
     )

@@ -70,6 +70,7 @@ class CorrectedDataset:
         turned = np.einsum("nij,nj->ni", self._turns_world[view], rays.directions_world)
         return replace(
             rays,
+            # unmoved views keep their rays to the bit
             origins_world=np.where(moved[:, None], self._origins_world[view], rays.origins_world),
             directions_world=np.where(moved[:, None], turned, rays.directions_world),
         )
@@ -119,6 +120,7 @@ def remove_common_motion(
             if not corrections[index].any():
                 continue
             rotation = new.rotation_cam_from_world @ back.T
+            # the inverse of the common similarity, on the camera's center
             origin = middle + back @ (new.origin_world - middle - shift) / (1 + growth)
             relative = rotation @ old.rotation_cam_from_world.T
             moved = RigidMotion(relative, -rotation @ origin - relative @ old.translation_cam_from_world)
@@ -142,10 +144,11 @@ def _common_similarity(
         jacobian[k, :3, :3] = np.eye(3)
         jacobian[k, 3:, 3:6] = np.eye(3) / extent
         offset = old.origin_world - middle
+        # a turn about the middle shifts a camera by turn x offset
         jacobian[k, 3:, :3] = np.cross(np.eye(3), offset).T / extent
         jacobian[k, 3:, 6] = offset / extent
     hessian = np.einsum("vik,vil->kl", jacobian, jacobian)
     diagonal = hessian.diagonal()
-    ridge = np.diag(1e-9 * diagonal + 1e-12)
+    ridge = np.diag(1e-9 * diagonal + 1e-12)  # against a singular matrix, as of cameras in one line
     common = np.linalg.solve(hessian + ridge, np.einsum("vik,vi->k", jacobian, motions))
     return common[:3], common[3:6], float(common[6])

@@ -42,10 +42,12 @@ def relative_log_brightness(dataset: TrackedTrainingData) -> Float64[np.ndarray,
     x, y = np.clip(observations.xy_px[rows].astype(np.int64), 0, sizes - 1).T
     rgb, _, weight = dataset.pixels(view, np.ascontiguousarray(y), np.ascontiguousarray(x))
     brightnesses = rgb.mean(axis=1, dtype=np.float64)
+    # clipped or dark values do not follow the exposure
     valid = (weight > 0) & (brightnesses > MIN_VALUE) & (brightnesses < MAX_VALUE)
     view, point, levels = view[valid], point[valid], np.log(brightnesses[valid])
     views = np.zeros(count)
     for _ in range(ROUNDS):
+        # alternating: points given the views, then views given the points
         points = _group_medians(levels - views[view], point, int(point.max(initial=0)) + 1)
         views = _group_medians(levels - points[point], view, count)
     known = np.bincount(view, minlength=count) >= MIN_POINTS
@@ -86,7 +88,7 @@ def resolve_exposure(
     """
     if exposure != "auto":
         return exposure, None
-    steady = has_materials or dataset.has_alpha
+    steady = has_materials or dataset.has_alpha  # what these show brighter need not be exposure
     reason = None if steady else exposure_change_notice(relative_log_brightness(dataset))
     return reason is not None, reason
 

@@ -113,8 +113,9 @@ def photograph_spline(
 
     def look(xy_px: Float64[np.ndarray, "n 2"]) -> PhotographSamples:
         known = (np.abs(xy_px) < OUTSIDE_PX).all(axis=1)
-        within = np.where(known[:, None], xy_px, 0.0) - 0.5
+        within = np.where(known[:, None], xy_px, 0.0) - 0.5  # pixel centers lie at halves
         first = np.floor(within).astype(np.int64) - 1
+        # all sixteen coefficients inside
         inside = known & (first >= 0).all(axis=1) & (first + 3 < (width, height)).all(axis=1)
         first = np.clip(first, 0, (max(width - 4, 0), max(height - 4, 0)))
         x = np.minimum(first[:, None, None, 0] + np.arange(4)[None, None, :], width - 1)
@@ -156,7 +157,7 @@ def align_camera(rendered: RenderedPoints, photograph: PhotographFn, camera: Cam
         now = _compare(rendered, photograph(camera.project(motion(points))))
     if before is None or now is None:
         return None
-    both = before.photograph.valid & now.photograph.valid
+    both = before.photograph.valid & now.photograph.valid  # only points that both show are compared
     better = both.sum() >= MIN_POINTS and _huber_cost(now, both, before.noise) < _huber_cost(
         before, both, before.noise
     )
@@ -172,6 +173,7 @@ def _compare(rendered: RenderedPoints, shown: PhotographSamples) -> _Comparison 
         exposed = _fit_exposure(rendered.rgb_srgb, shown.rgb_srgb, weights)
         errors = np.sqrt(np.square(exposed - shown.rgb_srgb).mean(axis=1))
         noise = max(MIN_NOISE, float(np.median(errors[shown.valid])))
+        # Huber's weights: large errors count by their size, not its square
         weights = shown.valid / np.maximum(errors, noise)
     return _Comparison(shown, exposed, errors, weights, noise)
 
@@ -216,6 +218,7 @@ def _gauss_newton_step(
     damping = np.where(np.arange(12) < 6, DAMPING * diagonal[:6].mean(), 0.0) + 1e-9 * diagonal + 1e-12
     step = np.linalg.solve(curvature + np.diag(damping), downhill)[:6]
     moved_px = np.linalg.norm(np.einsum("nik,k->ni", flow[now.photograph.valid], step), axis=1)
+    # the median point moves no farther than the residual's slope holds
     step *= min(1.0, MAX_RESIDUAL_STEP_PX / max(float(np.median(moved_px)), 1e-12))
     return step * np.repeat([1.0, depth], 3)
 

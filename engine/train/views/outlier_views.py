@@ -104,9 +104,11 @@ def find_outlier_views(
     for _ in range(2):  # the second time without those that the first found as neighbours
         above = psnr - _neighborhood_median(indices, psnr, trained & ~low, views)
         usual = float(np.median(above[trained]))
+        # MAD to standard deviation of a normal distribution
         sigma = 1.4826 * float(np.median(np.abs(above[trained] - usual)))
         below = usual - above
         if not trained.all():
+            # held-out views are worse as a rule: only the excess counts
             below[~trained] -= max(0.0, float(np.median(below[~trained])))
         low = below > max(OUTLIER_MARGIN_DB, sigmas * sigma)
     worst_first = np.argsort(-below, kind="stable")
@@ -158,6 +160,7 @@ def _neighborhood_median(
             1 - forward[part] @ forward.T
         )
         distances[:, ~counts] = np.inf
+        # a view is not its own neighbor
         distances[np.arange(len(distances)), np.arange(total)[part]] = np.inf
         nearest = np.argsort(distances, axis=1, kind="stable")[:, :neighbor_count]
         result[part] = np.median(psnr[nearest], axis=1)
@@ -230,6 +233,7 @@ class OutlierDetector:
         train = self._dataset.train_indices
         used = np.setdiff1d(train, left_out)
         measured = measure_views(self._dataset, used, self._background_srgb, tracer, shading)
+        # views left out before count towards the limit
         max_more = int(MAX_EXCLUDED_FRACTION * len(train)) - len(left_out)
         return np.sort(find_outlier_views(measured, self._dataset.views, used)[: max(0, max_more)])
 

@@ -121,6 +121,7 @@ class PoseRefiner:
             size_px = (view.width_px, view.height_px)
             photograph = photograph_spline(dataset, index, size_px, self._background_srgb)
             motion = align_camera(rendered, photograph, dataset.cameras[view.camera_index])
+            # a share of the motion, on top of the present correction
             if motion is not None:
                 found[index] = (
                     motion.scaled(STEP_FRACTION).compose(RigidMotion.from_vector(found[index])).to_vector
@@ -167,6 +168,7 @@ class PoseRefiner:
             result = tracer.trace(rays)
             shaded = shading.shade(TracedRays(rays, result, tracer, view))
             rgb = np.clip(shaded.composite_over(self._background_srgb), 0, 1)
+            # haze has no depth to align by
             has_surface = (result.depth_median > 0) & (result.alpha >= MIN_ALPHA)
             points_world = result.depth_median[:, None].astype(np.float64) * rays.directions_world
             for index in part.tolist():

@@ -68,6 +68,7 @@ def estimate_untrained_exposures(
 ) -> None:
     """Give held-out views the exposures that a camera would choose there, where exposures are learnt."""
     exposures = find_exposures(shading)
+    # not before a first step: all exposures are alike then
     if exposures is not None and exposures.steps.any():
         names = [view.name for view in dataset.views]
         exposures.estimate_untrained(names, _mean_brightness(dataset, background_srgb, tracer, shading))

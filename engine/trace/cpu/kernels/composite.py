@@ -75,12 +75,12 @@ def composite(
     eval_ray_view_basis(
         basis, forward.scene.sh.shape[1], to_mean, direction, ray_t_view_origin(forward.rays, r)
     )
-    weight = alpha * state.t1
+    weight = alpha * state.t1  # w_k = alpha_k T_k
     red, green, blue = eval_color(forward.scene.sh, i, basis)
     facing = weight * facing_sign(to_mean, (hit.normal_x, hit.normal_y, hit.normal_z), forward.limits)
     for f in range(forward.scene.features.shape[1]):
         forward.out.features[r, f] += np.float32(weight * forward.scene.features[i, f])
-    t1 = state.t1 * (1.0 - alpha)
+    t1 = state.t1 * (1.0 - alpha)  # T_(k+1) = T_k (1 - alpha_k)
     if forward.is_recording:
         hits = forward.hits
         hits.ids[state.next_hit_index] = i
@@ -90,6 +90,7 @@ def composite(
         hits.rgb[state.next_hit_index, 1] = green
         hits.rgb[state.next_hit_index, 2] = blue
     t2, second_phase = state.t2, state.second_phase
+    # the hit that crosses eps1 still belongs to the first phase
     if second_phase:
         t2 *= 1.0 - alpha
     elif t1 < forward.limits.eps1:
@@ -107,6 +108,7 @@ def composite(
         state.normal_x + facing * hit.normal_x,
         state.normal_y + facing * hit.normal_y,
         state.normal_z + facing * hit.normal_z,
+        # the distance at which T falls to one half
         t if state.t1 > 0.5 and t1 <= 0.5 else state.depth_median,
         count,
         state.next_hit_index + 1,

@@ -67,6 +67,7 @@ def write_geometry_gradients(
     w2 = on_r1 * r1[2] + on_r2 * r2[2] + on_r3 * r3[2] + r1[0] * moments.n1 - r1[1] * moments.n0
     # dL/dq = 2 (0, w) q / |q|^2: the rotation depends on the direction of q only
     factor = 2.0 / (q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
+    # w, x, y and z of the quaternion product (0, w) q
     out.quats[segment, 0] = factor * (-w0 * q1 - w1 * q2 - w2 * q3)
     out.quats[segment, 1] = factor * (w0 * q0 + w1 * q3 - w2 * q2)
     out.quats[segment, 2] = factor * (w1 * q0 + w2 * q1 - w0 * q3)
@@ -81,6 +82,7 @@ def write_geometry_gradients(
         )
     out.log_scales[segment, 0] = moments.huu
     out.log_scales[segment, 1] = moments.hvv
+    # da/dlogit = a (1 - a), and h is by ln a
     out.logits[segment] = moments.h * (1.0 - np.float64(primitives[i, OPACITY]))
 
 

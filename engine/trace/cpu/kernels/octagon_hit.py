@@ -58,12 +58,14 @@ def insert_hit(
 ) -> int:
     """Insert by (t, id) into the sorted buffer; drop hits that lie behind the ray's end. Return new count."""
     count = context_i32[COUNT]
+    # --- make room: the farthest hit of a full buffer leaves, and no longer attenuates the ray ---
     if count == HIT_BUFFER_SIZE:
         context_f64[TRANSMITTANCE] /= 1.0 - np.float64(context_f32[HIT_ALPHA + HIT_BUFFER_SIZE - 1])
         slot = HIT_BUFFER_SIZE - 1
     else:
         slot = count
         count += 1
+    # insertion from the back: most hits come nearly in order
     while slot > 0:
         t_before = context_f32[HIT_T + slot - 1]
         if t_before < t or (t_before == t and context_i32[HIT_ID + slot - 1] < gaussian_id):
@@ -107,7 +109,7 @@ def intersect_plane(
     x = context_f64[RAY_F64] - primitive[MEAN]
     y = context_f64[RAY_F64 + 1] - primitive[MEAN + 1]
     z = context_f64[RAY_F64 + 2] - primitive[MEAN + 2]
-    return -(x * nx + y * ny + z * nz) / cosine, cosine > 0.0
+    return -(x * nx + y * ny + z * nz) / cosine, cosine > 0.0  # t = <m - o, r1> / <d, r1>
 
 
 @device_function(forceinline=True, fastmath={"contract"})
@@ -121,6 +123,7 @@ def eval_octagon(
     u = x * primitive[AXIS_U] + y * primitive[AXIS_U + 1] + z * primitive[AXIS_U + 2]
     v = x * primitive[AXIS_V] + y * primitive[AXIS_V + 1] + z * primitive[AXIS_V + 2]
     abs_u, abs_v = abs(u), abs(v)
+    # Edge normals stand at 22.5 + 45 k degrees; the absolute values map all eight to these two.
     farthest = max(abs_u * COS_22 + abs_v * SIN_22, abs_u * SIN_22 + abs_v * COS_22)
     return u, v, farthest <= primitive[INNER_RADIUS]
 
@@ -153,6 +156,7 @@ def callback_arguments(
     context_i32 = carray(int32_pointer(words[3]), CONTEXT_WORDS)
     context_f32 = carray(float32_pointer(words[3]), CONTEXT_WORDS)
     context_f64 = carray(float64_pointer(words[3]), CONTEXT_WORDS // 2)
+    # the context's own words, behind the two of Embree's
     context_u64 = carray(uint64_pointer(words[3]), CONTEXT_WORDS // 2)
     ray = carray(float32_pointer(words[4]), RAY_WORDS)
     record = carray(
@@ -167,9 +171,11 @@ def intersect_octagon(arguments: Address) -> None:
     """Intersect one ray (RTCIntersectFunctionN): exact plane hit, octagon test, alpha, insertion."""
     gaussian, context_i32, context_f32, context_f64, ray, record = callback_arguments(arguments)
     distance, behind = intersect_plane(record, context_f64)
+    # compared in float32, the precision that hits are stored and ordered in
     t = np.float32(distance)
     if t > ray[RAY_TFAR] or t >= context_f32[T_MAX] or t < context_f32[LAST_T]:
         return
+    # Traversal starts again at the last hit gathered: of equal distances only larger ids are new.
     if t == context_f32[LAST_T] and gaussian <= context_i32[LAST_ID]:
         return
     if behind and t < context_f32[T_BACKFACE_CULL]:
@@ -177,6 +183,7 @@ def intersect_octagon(arguments: Address) -> None:
     u, v, inside = eval_octagon(record, context_f64, distance)
     if not inside:
         return
+    # a full buffer refuses what lies behind its last hit
     if context_i32[COUNT] == HIT_BUFFER_SIZE:
         t_last = context_f32[HIT_T + HIT_BUFFER_SIZE - 1]
         if t > t_last or (t == t_last and gaussian > context_i32[HIT_ID + HIT_BUFFER_SIZE - 1]):

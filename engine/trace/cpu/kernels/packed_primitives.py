@@ -48,6 +48,7 @@ def opacity_and_radius(logit: float, q: float) -> tuple[float, float]:
     # without overflow at either end
     part = math.exp(-abs(logit))
     opacity = (1.0 if logit > 0 else part) / (1.0 + part)
+    # alpha = exp(-q / 2) at a corner, so that r^2 = q + 2 ln a
     return opacity, math.sqrt(max(0.0, q + 2.0 * math.log(opacity)))
 
 
@@ -80,6 +81,7 @@ def pack_primitive(
     for axis in range(3):
         primitives[i, MEAN + axis] = means[i, axis]
         primitives[i, NORMAL + axis] = r1[axis]
+        # r2 / s2 and r3 / s3: a dot product with them is in standard deviations
         primitives[i, AXIS_U + axis] = r2[axis] * per_s2
         primitives[i, AXIS_V + axis] = r3[axis] * per_s3
     # A Gaussian without an octagon must not be hit even through its centre.
@@ -115,7 +117,7 @@ def write_box(
     a, b, r2, r3 = ellipse_semi_axes(i, parameters, q)
     reach = padding * max(a, b)
     for axis in range(3):
-        half = math.sqrt((a * r2[axis]) ** 2 + (b * r3[axis]) ** 2)
+        half = math.sqrt((a * r2[axis]) ** 2 + (b * r3[axis]) ** 2)  # half-width of an ellipse's box
         centre = np.float64(parameters.means[i, axis])
         # Room for float32 rounding in the box test, and for changes to come.
         half += reach + 4e-6 * (abs(centre) + half)
@@ -158,14 +160,14 @@ def refit_outgrown_boxes(
     for k in range(first, last):
         i = ids[k]
         now = np.empty(6, np.float32)
-        write_box(now, i, parameters, q, 0.0)
+        write_box(now, i, parameters, q, 0.0)  # without padding: what is needed now
         out = np.float32(0.0)
         for axis in range(3):
             out = max(out, boxes[i, axis] - now[axis], now[3 + axis] - boxes[i, 3 + axis])
-        if out > 0.0 and now[0] <= now[3]:
+        if out > 0.0 and now[0] <= now[3]:  # not for a vanished octagon, whose box is inside out
             outgrown[k] = True
             write_box(boxes[i], i, parameters, q, padding)
-            if out < np.inf:
+            if out < np.inf:  # infinite where the old box was inside out
                 for axis in range(3):
                     boxes[i, axis] -= 4 * out
                     boxes[i, 3 + axis] += 4 * out

@@ -96,6 +96,7 @@ def init_moment_rows(
         if backward.output_gradients.has_geometry:
             for column in range(GEOMETRY_WORDS):
                 rows.geometry[row, column] = np.float32(0.0)
+            # from the raw quaternion: the record's normal is rounded to float32
             r1, _r2, _r3 = gaussian_axes(quats, i)
             x, y, z = means[i, 0] - ox, means[i, 1] - oy, means[i, 2] - oz
             side = facing_sign((x, y, z), r1, backward.limits)
@@ -190,6 +191,7 @@ def backward_ray_in_packet(
         log_alpha_gradients.ctypes.data,
     )
     behind = np.float64(output_gradients.transmittance[r]) * transmittance
+    # from the last group of eight, which may be incomplete
     for begin in range((count - 1) // WIDTH * WIDTH, -1, -WIDTH):
         n, e = min(WIDTH, count - begin), start + begin
         if output_gradients.has_geometry or feature_count > 0:
@@ -207,6 +209,7 @@ def backward_ray_in_packet(
                         * features[packet_hits.slot_ids[slot_base + slot], f]
                     )
                 weight_gradients[k] = weight_gradient
+        # the hits' part that all scenes have: colors and transmittance
         behind = backward_hits8(
             Hits8(
                 hits.alphas.ctypes.data + e * 4, transmittance_before.ctypes.data + begin * 8,
@@ -274,5 +277,6 @@ def backward_packets(
             break
         slots = packet_hits.slot_counts[packet]
         if slots > len(memory.normals):
+            # a quarter more, so that slightly larger packets fit as well
             memory = allocate_backward_scratch(max_hits, slots * 5 // 4)
         backward_packet(packet, memory, backward, packets, hits, packet_hits, counts, rows)

@@ -56,14 +56,17 @@ def morton_keys(
             u2 += np.float64(primitives[i, AXIS_U + axis]) ** 2
             v2 += np.float64(primitives[i, AXIS_V + axis]) ** 2
             total += primitives[i, MEAN + axis]
+        # the axes are r2 / s2 and r3 / s3: the shorter one is that of the larger scale
         size = radius / math.sqrt(min(u2, v2))
         if not (size < 1e30 and math.isfinite(total)):
             keys[i] = INVALID_KEY
             continue
+        # half a binary logarithm: factors of four
         level = min(int(0.5 * math.log2(max(size * inverse_cell, 1.0))), _SIZE_CLASSES - 1)
-        key = np.uint64(_SIZE_CLASSES - 1 - level) << np.uint64(3 * _CURVE_BITS)
+        key = np.uint64(_SIZE_CLASSES - 1 - level) << np.uint64(3 * _CURVE_BITS)  # large ones first
         for axis in range(3):
             cell = (np.float64(primitives[i, MEAN + axis]) - low[axis]) * inverse_cell
+            # interleaved x, y, z
             key |= _spread_bits(np.uint64(min(max(cell, 0.0), MAX_CELL))) << np.uint64(axis)
         keys[i] = key
 

@@ -139,6 +139,7 @@ def find_packet_starts(
             same = one_origin or (
                 origins[r, 0] == origins[first, 0]
                 and origins[r, 1] == origins[first, 1]
+                # origins are compared to the bit: moments are only enough for one common origin
                 and origins[r, 2] == origins[first, 2]
             )
             if same and cosine >= min_cosine:
@@ -162,6 +163,7 @@ def find_candidates(
 ) -> tuple[Candidates, int]:
     """Find the candidates of the packet of rays ``first`` to ``last`` and return their count."""
     write_frustum(rays, first, last, frustum)
+    # t_max of the packet: the largest of its rays
     one_end = len(rays.t_max) == 1
     farthest = rays.t_max[0 if one_end else first]
     if not one_end:
@@ -169,6 +171,7 @@ def find_candidates(
             farthest = max(farthest, rays.t_max[r])
     origin = ray_origin(rays, first)
     count = gather_candidates(bvh, frustum, origin, farthest, traversal, candidates)
+    # Too many were found: only counted, and gathered again with room for all.
     if count > len(candidates.curve_indices):
         candidates = allocate_candidates((count * 5 // 4 + WIDTH - 1) // WIDTH * WIDTH)
         count = gather_candidates(bvh, frustum, origin, farthest, traversal, candidates)
@@ -209,6 +212,7 @@ def write_packet_primitive(
     a0, a1, a2 = primitive_vector(primitive, AXIS_U)
     b0, b1, b2 = primitive_vector(primitive, AXIS_V)
     height = x * n0 + y * n1 + z * n2
+    # Rows of u (N.d) = A.d and v (N.d) = B.d, from t = n0 / (N.d) and u = (t <d, r2> - <x, r2>) / s2
     xa = x * a0 + y * a1 + z * a2
     xb = x * b0 + y * b1 + z * b2
     write_in_packet_frame(block, N_X, lane, frame, n0, n1, n2)
@@ -245,6 +249,7 @@ def write_candidate_blocks(
             if prefetch_sh:
                 prefetch(sh_at + ids[k + PREFETCH_DISTANCE] * sh_bytes)
         block, lane = rows[k // WIDTH], k % WIDTH
+        # padding that no ray hits: a plane across the axis and a negative radius
         if k >= count:
             for row in range(ROWS):
                 block[row, lane] = np.float32(0.0)

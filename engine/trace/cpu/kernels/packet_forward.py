@@ -164,6 +164,7 @@ def find_ray_end(
         last = lowest_bit(bits)
         if not last_phase:
             last_phase = True
+            # T2 = T / T_last, so that the phase ends where T < T_last eps2
             stop_below = transmittance_after[last] * eps2
             last += 1
             while last < count and transmittance_after[last] >= stop_below:
@@ -186,7 +187,7 @@ def fill_slots(
         The number of slots.
     """
     candidates, ids, forward = packet.candidates, packet.candidates.ids, packet.forward
-    if new_hits & (new_hits - 1) != 0:
+    if new_hits & (new_hits - 1) != 0:  # a single one would be waited for at once
         prefetch_colors(new_hits, scratch.candidate_indices, ids, forward.scene)
     while new_hits != 0:
         k = lowest_bit(new_hits)
@@ -253,6 +254,7 @@ def trace_ray(
     feature_count = features.shape[1]
     if forward.is_recording:
         forward.hits.starts[r] = first_hit
+    # eight sums: color, 0, normal, 0
     scratch.sums[:] = 0.0
     scratch.depth_sums[:] = 0.0
     for f in range(feature_count):
@@ -287,7 +289,7 @@ def trace_ray(
             taken, stop, last_phase, stop_below = find_ray_end(
                 bits, bits >> (2 * WIDTH), last_phase, stop_below, limits.eps2, scratch.transmittance_after
             )
-            if transmittance > 0.5:
+            if transmittance > 0.5:  # the median lies among these eight only if it was not passed before
                 halves = (bits >> WIDTH) & ((1 << taken) - 1)
                 if halves != 0:
                     median = float32_from_bits(np.uint32(keys[head + lowest_bit(halves)] >> HIGH_WORD_SHIFT))
@@ -310,6 +312,7 @@ def trace_ray(
                 store_hits(keys_at, taken, first_hit, packet, scratch)
             transmittance = scratch.transmittance_after[taken - 1]
             head, first_hit, found = head + taken, first_hit + taken, found + taken
+            # the tracer's own limit, beside that of the transmittance
             stop = stop or found >= limits.max_hits
         b0 = b1
         stop = stop or nearest >= span[1]
@@ -341,7 +344,7 @@ def trace_packets(
         origin = ray_origin(forward.rays, first)
         write_candidate_blocks(candidates, count, forward.scene, origin, pyramid.frame, True)
         candidates.slots[:count] = -1
-        slots = 0
+        slots = 0  # also the slots' place: each packet writes where its first ray may
         place = first_hit_index(first, forward.limits)
         state = PacketTrace(forward, candidates, count, packet_hits, place, origin, pyramid.frame)
         for r in range(first, last):

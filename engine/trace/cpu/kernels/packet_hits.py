@@ -49,6 +49,7 @@ def sort_ties_by_id(candidates: Candidates, first: int, last: int) -> None:
 @njit_no_refcount()
 def sort_hits(candidates: Candidates, rank_buffer: UInt64[np.ndarray, "104"], first: int, last: int) -> None:
     """Sort the hits ``first`` to ``last`` of a ray by distance, and by id where they share one."""
+    # stable by construction: places in the lower halves make all keys different
     if last - first <= RANK_SORT_MAX:
         if rank_sort(candidates.hit_keys.ctypes.data + first * 8, last - first, rank_buffer.ctypes.data):
             sort_ties_by_id(candidates, first, last)
@@ -87,6 +88,7 @@ def intersect_blocks(
         c.vs.ctypes.data, c.hit_candidates.ctypes.data,
     )  # fmt: skip
     blocks_at = c.blocks.ctypes.data
+    # a chunk begins at a multiple of its size, so that its bits are in one word
     bits = (
         c.ray_block_masks[first // MASK_BITS, ray_bit] >> np.uint64(first % MASK_BITS)
     ) & CHUNK_BLOCKS_MASK

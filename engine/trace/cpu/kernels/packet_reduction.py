@@ -81,6 +81,7 @@ def reduce_weights(
     for segment in range(first, last):
         total = 0.0
         for k in range(gaussian_segments.starts[segment], gaussian_segments.starts[segment + 1]):
+            # in the order of the packets: the sum does not depend on the threads
             total += weights[gaussian_segments.order[k]]
         out[segment] = total
 
@@ -133,6 +134,7 @@ def sum_rows_of_origin(
         for f in range(len(features)):
             features[f] += rows.features[row, f]
         k += 1
+        # origins compare by their bits
         if k == end or packet_origin(order[k], words, rays, packets) != origin:
             break
     return k, (gt, gtu, gtv), (t0, t1, t2)
@@ -195,6 +197,7 @@ def reduce_packets_chunk(
                 side = facing_sign((x, y, z), r1, limits)
                 n0, n1, n2 = n0 + side * t0, n1 + side * t1, n2 + side * t2
             hu, hv, huu, huv, hvv = here[HU], here[HV], here[HUU], here[HUV], here[HVV]
+            # tau = (g_t t - h u (u + xa) - h v (v + xb)) / n0, summed; then times u and times v
             tau += (gt - huu - xa * hu - hvv - xb * hv) * inverse
             tau_u += (gtu - here[HUUU] - xa * huu - xb * huv) * inverse
             tau_v += (gtv - here[HVVV] - xa * huv - xb * hvv) * inverse
@@ -230,7 +233,7 @@ def reduce_packets(
 
     Takes one of ``chunks`` parts after the other until the ``counter`` has passed the last.
     """
-    per_chunk = (len(segment_indices) + chunks - 1) // chunks
+    per_chunk = (len(segment_indices) + chunks - 1) // chunks  # rounded up; the last chunks may be empty
     while True:
         chunk = atomic_fetch_next(counter.ctypes.data)
         if chunk >= chunks:

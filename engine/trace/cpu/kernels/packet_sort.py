@@ -26,11 +26,13 @@ def sort_candidates(
     )
     block_rays = candidates.block_ray_masks
     sort_by_distance(candidates, count, histogram)
+    # --- suffix minima: no candidate from k on has a hit before near[k] ---
     nearest = np.float32(np.inf)
     near[count] = nearest
     for k in range(count - 1, -1, -1):
         nearest = min(nearest, bounds[np.int64(keys[k] & np.uint64(0xFFFFFFFF))])
         near[k] = nearest
+    # --- within each chunk a counting sort by cell: neighbours in the cross section share their rays ---
     for b in range((count + WIDTH - 1) // WIDTH):
         block_rays[b] = 0
     for start in range(0, count, CHUNK):
@@ -91,7 +93,7 @@ def transpose_ray_masks(candidates: Candidates, count: int) -> None:
                     bits[k] ^= change << step
                     bits[other] ^= change
             step >>= np.uint64(1)
-            mask ^= mask << step
+            mask ^= mask << step  # 32 ones, then 16 ones and 16 zeros in turn, down to single bits
 
 
 @njit_no_refcount()
@@ -124,7 +126,7 @@ def radix_sort_keys(
     low, high = low >> np.uint64(32), high >> np.uint64(32)
     shift = np.uint64(32)
     span = high - low
-    while span >= np.uint64(1 << 16):
+    while span >= np.uint64(1 << 16):  # until the span of the distances fits two digits of eight bits
         span >>= np.uint64(1)
         shift += np.uint64(1)
     low <<= np.uint64(32)
@@ -142,5 +144,5 @@ def radix_sort_keys(
             bucket = ((keys[k] - low) >> at) & np.uint64(255)
             scratch[histogram[bucket]] = keys[k]
             histogram[bucket] += 1
-        keys, scratch = scratch, keys
+        keys, scratch = scratch, keys  # swapped twice: the sorted keys end in the caller's array
     insertion_sort(keys, count)

@@ -40,6 +40,7 @@ def ray_transmittance(
     block_count = (count + WIDTH - 1) // WIDTH
     transmittance = 1.0
     for b0 in range(0, block_count, BLOCKS_PER_CHUNK):
+        # hits in any order: a product of 1 - alpha does not depend on it
         tail = intersect_blocks(candidates, ray_bit, b0, slopes, span, 0)
         eval_alphas(candidates, 0, tail, limits.alpha_max)
         for m in range(tail):

@@ -80,6 +80,7 @@ def write_plane(plane: Float32[np.ndarray, "9"], x: float, y: float, z: float) -
 def write_frustum(rays: RayArrays, first: int, last: int, frustum: Frustum) -> None:
     """Write the pyramid around rays ``first`` to ``last``."""
     planes, frame, directions = frustum.planes, frustum.frame, rays.directions
+    # --- the axis: the mean direction ---
     x = y = z = 0.0
     for r in range(first, last):
         x += directions[r, 0]
@@ -98,6 +99,7 @@ def write_frustum(rays: RayArrays, first: int, last: int, frustum: Frustum) -> N
     frame[0], frame[1], frame[2] = x, y, z
     frame[3], frame[4], frame[5] = e0, e1, e2
     frame[6], frame[7], frame[8] = f0, f1, f2
+    # --- slopes along e and f that enclose all rays, and the planes through them ---
     a_low = b_low = np.inf
     a_high = b_high = -np.inf
     for r in range(first, last):
@@ -109,7 +111,7 @@ def write_frustum(rays: RayArrays, first: int, last: int, frustum: Frustum) -> N
     write_plane(planes[1], a_high * x - e0, a_high * y - e1, a_high * z - e2)
     write_plane(planes[2], f0 - b_low * x, f1 - b_low * y, f2 - b_low * z)
     write_plane(planes[3], b_high * x - f0, b_high * y - f1, b_high * z - f2)
-    write_plane(planes[4], x, y, z)
+    write_plane(planes[4], x, y, z)  # across the axis: nothing behind the origin
     frame[9], frame[10], frame[11], frame[12] = a_low, a_high, b_low, b_high
     write_ray_bins(rays, first, last, frame, frustum.prefix_masks)
     for k in range(FRAME_WORDS):
@@ -134,9 +136,10 @@ def gather_candidates(
     nodes_at, blocks_at = bvh.nodes.ctypes.data, bvh.leaf_blocks.ctypes.data
     planes_at = frustum.planes.ctypes.data
     top = len(level_starts) - 2
-    stack[0], stack[1] = level_starts[top], top
+    stack[0], stack[1] = level_starts[top], top  # the one node of the top level
     depth, waiting, n_found = 1, 0, 0
     while depth > 0 or waiting > 0:
+        # Test when the queue has no room for another node's eight blocks, or nothing else is left.
         if depth == 0 or waiting > BLOCK_QUEUE_SIZE - WIDTH:
             n_found = test_blocks(bvh, frustum, origin, t_max, traversal, waiting, candidates, n_found)
             waiting = 0
@@ -151,6 +154,7 @@ def gather_candidates(
             if level == 0:
                 prefetch_bytes(blocks_at + child * LEAF_BLOCK_BYTES, LEAF_BLOCK_BYTES)
                 blocks[waiting] = child
+                # depth first, so that the stack stays short
                 waiting += 1
             else:
                 child += level_starts[level - 1]

@@ -38,6 +38,7 @@ def _count_digits(
 def _add_up(histograms: Int64[np.ndarray, "chunks buckets"]) -> None:
     """Replace each count by the place of its first key."""
     total = 0
+    # For each bucket chunk by chunk: equal keys keep their order, so that the sort is stable.
     for b in range(BUCKETS):
         for c in range(len(histograms)):
             size = histograms[c, b]
@@ -63,6 +64,7 @@ def _scatter(
         for e in range(c * per, min(count, (c + 1) * per)):
             bucket = np.int64(keys[e] >> shift) & (BUCKETS - 1)
             slot = histograms[c, bucket]
+            # each chunk has places of its own: threads never write to the same one
             histograms[c, bucket] = slot + 1
             keys_out[slot] = keys[e]
             order_out[slot] = order[e]
@@ -121,7 +123,7 @@ def stable_argsort(
         _add_up(histograms)
         run_ranges(_scatter, threads, chunks, source, order, shift, target, order_out, histograms, grain=1)
         order, order_out = order_out, order
-        source, target = target, spare if source is keys else source
+        source, target = target, spare if source is keys else source  # the caller's keys are never written to
     return order, source
 
 

@@ -59,7 +59,9 @@ def write_ray_bins(
         bit = np.uint64(1) << np.uint64(r - first)
         for axis, slope in enumerate((a, b)):
             place = (slope - frame[9 + 2 * axis]) * frame[13 + axis]
+            # one further on: row i gets the bins before i
             prefix_masks[axis, np.int64(min(max(place, 0.0), BINS - 1.0)) + 1] |= bit
+    # running unions, so that any range of bins is a difference of two rows
     for i in range(BINS):
         prefix_masks[0, i + 1] |= prefix_masks[0, i]
         prefix_masks[1, i + 1] |= prefix_masks[1, i]
@@ -88,7 +90,7 @@ def _distances(
     steepest = on_axis + (f[9] * on_e).maximum(f[10] * on_e) + (f[11] * on_f).maximum(f[12] * on_f)
     steepest = steepest + unsure
     reach = (u_axis * u_axis + v_axis * v_axis).sqrt()
-    near = middle - reach - (far + size) * ROUNDING_MARGIN
+    near = middle - reach - (far + size) * ROUNDING_MARGIN  # near end of the ellipse along the axis
     least = (steepest > 0.0).select(near.maximum((height - far * unsure) / steepest), near)
     likely = (on_axis > 0.0).select(height / on_axis, middle)
     likely = likely.maximum(near).minimum(middle + reach)
@@ -130,6 +132,7 @@ def ellipse_bins(
         u, v = [rows[3 + k] for k in range(3)], [rows[6 + k] for k in range(3)]
         middle, u_axis, v_axis = dot(m, f[0:3]), dot(u, f[0:3]), dot(v, f[0:3])
         depth2, reach2 = middle * middle, u_axis * u_axis + v_axis * v_axis
+        # wholly in front of the origin, with room for rounding; else no bounds on its slopes exist
         in_front = (depth2 > reach2 * 1.1) & (middle > 0.0)
         per_middle = 1.0 / middle
         inverse = 1.0 / (depth2 - reach2)
@@ -156,7 +159,7 @@ def ellipse_bins(
             out[2 * axis + 1] = last.maximum(0.0).minimum(BINS - 1.0).to_int32()
         out = VectorRows(builder, distances, FLOAT8)
         out[0], out[1] = _distances(m, u, v, f)
-        return (reach2 >= 0.0).to_bitmask()
+        return (reach2 >= 0.0).to_bitmask()  # false for a vanished octagon, whose legs are not-a-number
 
     return signature, codegen
 
@@ -173,6 +176,7 @@ def rays_in_bins(
     """Return bits of the rays in the bins of one lane, and the cell of their middle."""
     i0, i1, j0, j1 = bins[0, lane], bins[1, lane], bins[2, lane], bins[3, lane]
     mask = prefix_masks[0, i1 + 1] & ~prefix_masks[0, i0] & prefix_masks[1, j1 + 1] & ~prefix_masks[1, j0]
+    # cell of the middle, its bits interleaved as a Z-order number
     i, j = (i0 + i1) * CELL_GRID // (2 * BINS), (j0 + j1) * CELL_GRID // (2 * BINS)
     cell = 0
     for bit in range(3):

@@ -86,6 +86,7 @@ def facing_sign(
     if along <= 0.0:
         return 1.0
     beyond = limits.flip_normal_cos
+    # without a threshold every normal is turned towards the origin
     return -1.0 if beyond == 0.0 or along > beyond * math.sqrt(x * x + y * y + z * z) else 1.0
 
 

@@ -138,7 +138,7 @@ def write_ray_rows(
         k = r - first
         rows[SLOPE_A, k], rows[SLOPE_B, k], rows[PER_AXIS, k] = ray_slopes(rays, r, frame)
         rows[T_MIN, k], rows[T_MAX, k] = ray_limits(rays, r)
-    for k in range(last - first, PACKET_RAYS):
+    for k in range(last - first, PACKET_RAYS):  # a zero length of sight: these lanes are never hit
         rows[SLOPE_A, k] = rows[SLOPE_B, k] = rows[T_MIN, k] = rows[T_MAX, k] = np.float32(0.0)
         rows[PER_AXIS, k] = np.float32(1.0)
 
@@ -176,9 +176,11 @@ def trace_packet_shared_sort(
     write_ray_rows(forward.rays, first, last, frame, scratch.ray_rows)
     state_rows[:, :] = np.float32(0.0)
     state_rows[TRANSMITTANCE, : last - first] = np.float32(1.0)
+    # bits of the rays that still have transmittance left
     alive = ~np.uint64(0) >> np.uint64(PACKET_RAYS - (last - first))
     met = 0
     for k in range(count):
+        # the records to come, as far as any live ray may meet them
         if k + PREFETCH_DISTANCE < count:
             which = np.int64(keys[k + PREFETCH_DISTANCE] & CANDIDATE_MASK)
             if masks[which] & alive != 0:
@@ -192,6 +194,7 @@ def trace_packet_shared_sort(
         i, line = order[found[which]], scratch.packet_primitives[met]
         line_at = line.ctypes.data
         write_packet_primitive(line, 0, scene.primitives[i], origin, frame)
+        # --- who hits it: sixteen rays at a time; its color is only evaluated if any does ---
         bits = np.uint64(0)
         for group in range(GROUPS):
             if group_lanes(may, group) != 0:
@@ -205,6 +208,7 @@ def trace_packet_shared_sort(
                 scratch.color_normal[axis],
                 scratch.color_normal[4 + axis],
             )
+        # --- composite it into those ---
         for group in range(GROUPS):
             here = group_lanes(bits, group)
             if here != 0:
@@ -212,7 +216,7 @@ def trace_packet_shared_sort(
                     line_at, scratch.normal.ctypes.data, seen_at, met_at, group, here, least
                 )  # fmt: skip
                 at = np.uint64(GROUP_SIZE * group)
-                alive &= np.uint64(after) << at | ~(GROUP_MASK << at)
+                alive &= np.uint64(after) << at | ~(GROUP_MASK << at)  # clears bits of this group only
         scratch.hit_ids[met], scratch.hit_masks[met] = i, bits
         met += 1
         if alive == 0:
@@ -286,6 +290,7 @@ def trace_packets_shared_sort(
         )
         write_packet_outputs(first, last, view.state_rows, forward.out)
         if forward.is_recording:
+            # places are taken in the order in which packets finish; sums later go by packet
             start = atomic_fetch_add(hit_counter.ctypes.data, met)
             if start + met <= len(packet_hits.ids):
                 store_packet_hits(packet, met, pyramid.frame, view, packet_hits, start)

@@ -63,11 +63,13 @@ def backward_packet_shared_sort(
         k = r - first
         for channel in range(3):
             back[GRAD_RED + channel, k] = output_gradients.rgb[r, channel]
+        # what lies behind the last hit: the background through the final transmittance
         back[ERROR, k] = output_gradients.ray_errors[r]
         back[GRAD_BEHIND, k], back[TRANSMITTANCE_BEHIND, k] = (
             output_gradients.transmittance[r] * packet_hits.transmittance[r],
             packet_hits.transmittance[r],
         )
+    # --- back to front over the packet's shared order ---
     for k in range(packet_hits.counts[packet] - 1, -1, -1):
         line_at = packet_hits.packet_primitives.ctypes.data + (start + k) * (PACKET_PRIMITIVE_WORDS * 4)
         scratch.moments[:, :] = np.float32(0.0)

@@ -115,11 +115,13 @@ def intersect_group16(
         line = _word_loader(builder, line)
         rays, seen, met = (_group_rows(builder, at, group) for at in (rays, seen, met))
         u, v, slant, inverse = _plane_uv(rays, line)
+        # edge normals of the octagon; the absolute values map all eight to two
         cos_22, sin_22 = 0.9238795325112867, 0.3826834323650898
         farthest = (abs(u) * cos_22 + abs(v) * sin_22).maximum(abs(u) * sin_22 + abs(v) * cos_22)
         t = line(N_0) * inverse * rays[PER_AXIS]
         here = (farthest <= line(INNER_RADIUS_ROW)) & (abs(slant) >= rays[PER_AXIS] * 1e-6)
         here = here & (t > rays[T_MIN]) & (t < rays[T_MAX])
+        # a ray that has ended, or reached its limit of hits, takes no part
         here = here & (seen[TRANSMITTANCE] >= broadcast(builder, least_left, GROUP_SIZE))
         here = here & (seen[COUNT] < broadcast(builder, most_hits, GROUP_SIZE))
         met[ALPHA] = _mask_lanes(builder, here.value, _eval_alpha(builder, u, v, line, alpha_max))
@@ -154,6 +156,7 @@ def composite_group16(
         line, normal = _word_loader(builder, line), _word_loader(builder, normal)
         seen, met = _group_rows(builder, seen, group), _group_rows(builder, met, group)
         here = builder.bitcast(builder.trunc(bits, ir.IntType(GROUP_SIZE)), MASK16)
+        # Lanes that are not hit have alpha 0, so that they keep their sums and transmittance.
         alpha, before = met[ALPHA], seen[TRANSMITTANCE]
         weight = before * alpha
         for axis in range(3):
@@ -200,6 +203,7 @@ def backward_group16(
         moments = VectorRows(builder, moments, FLOAT16)
         here = builder.bitcast(builder.trunc(bits, ir.IntType(GROUP_SIZE)), MASK16)
         u, v, _slant, _inverse = _plane_uv(rays, line)
+        # lanes that are not hit may hold infinities, which zero weights would not cancel
         u, v = _mask_lanes(builder, here, u), _mask_lanes(builder, here, v)
         alpha = _mask_lanes(builder, here, _eval_alpha(builder, u, v, line, alpha_max))
         per_passed = 1.0 / (1.0 - alpha)
@@ -207,7 +211,7 @@ def backward_group16(
         weight = transmittance * alpha
         slopes = [back[GRAD_RED + channel] for channel in range(3)]
         value = slopes[0] * line(COLOR) + slopes[1] * line(COLOR + 1) + slopes[2] * line(COLOR + 2)
-        h = (transmittance * value - back[GRAD_BEHIND] * per_passed) * alpha
+        h = (transmittance * value - back[GRAD_BEHIND] * per_passed) * alpha  # dL/dalpha times alpha
         h = (alpha >= broadcast(builder, alpha_max, GROUP_SIZE)).select(0.0, h)
         back[GRAD_BEHIND] = weight * value + back[GRAD_BEHIND]
         back[TRANSMITTANCE_BEHIND] = transmittance

@@ -129,6 +129,7 @@ def intersect_block8(
         slant = along(N_X)  # the cosine times per_axis, as (1, a, b) is longer than the ray
         inverse = 1.0 / slant
         u, v = along(A_X) * inverse, along(B_X) * inverse
+        # edge normals of the octagon; the absolute values map all eight to two
         cos_22, sin_22 = 0.9238795325112867, 0.3826834323650898
         farthest = (abs(u) * cos_22 + abs(v) * sin_22).maximum(abs(u) * sin_22 + abs(v) * cos_22)
         t = rows[N_0] * inverse * per_axis
@@ -138,6 +139,7 @@ def intersect_block8(
 
         compressed = CompressedStore(context, builder, met.value)
         places = builder.add(splat(builder, tail, I64), ir.Constant(LONG8, list(range(LANES))))
+        # distances beyond t_min are positive, so that their bits sort like the numbers
         distance = builder.zext(compressed.compress(builder.bitcast(t.value, INT8)), LONG8)
         key = builder.or_(builder.shl(distance, ir.Constant(LONG8, [32] * LANES)), places)
         store(builder, key, element_address(builder, keys, tail, 8))
@@ -273,6 +275,7 @@ def composite8(
             weights,
             transmittance_after,
         ) = args
+        # keys below the safe one come first, as they are sorted
         key = load(builder, keys, LONG8)
         valid = builder.icmp_unsigned("<", key, splat(builder, safe_key, I64))
         valid = builder.and_(valid, first_lanes_mask(builder, max_count))
@@ -285,7 +288,7 @@ def composite8(
         before_all = broadcast(builder, transmittance)
         transmittance_behind = product * before_all
         store(builder, (alpha * (product_before * before_all)).value, weights)
-        store(builder, transmittance_behind.value, transmittance_after)
+        store(builder, transmittance_behind.value, transmittance_after)  # running product of 1 - alpha
         count = builder.ctpop(Vector(builder, valid).to_bitmask())
         stops = (transmittance_behind < broadcast(builder, min_transmittance)).to_bitmask()
         halves = builder.shl((transmittance_behind <= 0.5).to_bitmask(), ir.Constant(I64, LANES))

@@ -129,6 +129,7 @@ def backward_hits8(
         rows, weights, log_alpha_gradients = cgutils.unpack_tuple(builder, out)
         valid = first_lanes_mask(builder, count)
         slot = builder.sext(load(builder, slots, INT8), LONG8)
+        # lanes beyond the count gather from slot 0, which exists
         slot = builder.select(valid, slot, ir.Constant(LONG8, [0] * LANES))
         weight_gradient = VectorRows(builder, weight_gradients, DOUBLE8)[0]
         first_word = builder.mul(slot, ir.Constant(LONG8, [3] * LANES))
@@ -144,9 +145,10 @@ def backward_hits8(
         transmittance_before = VectorRows(builder, transmittance_before, DOUBLE8)[0]
         weight = keep_first_lanes(builder, alpha * transmittance_before, count)
         weighted = keep_first_lanes(builder, weight * weight_gradient, count)
+        # what lies behind each hit, within the eight
         sums = prefix_scan(builder, weighted, lambda a, b: a + b, 0.0, reverse=True)
         later = shift_lanes(builder, sums, -1, 0.0) + broadcast(builder, behind)
-        h = (transmittance_before * weight_gradient - later / (1.0 - alpha)) * alpha
+        h = (transmittance_before * weight_gradient - later / (1.0 - alpha)) * alpha  # dL/dalpha times alpha
         h = keep_first_lanes(builder, clamped.select(0.0, h), count)
         weight, h = builder.fptrunc(weight.value, FLOAT8), builder.fptrunc(h.value, FLOAT8)
         store(builder, weight, weights)
@@ -194,13 +196,14 @@ def _accumulate_moments(
     def plus(a: ir.Value, b: ir.Value) -> ir.Value:
         return builder.fadd(a, b, flags=("contract",))
 
+    # --- the first eight words: moments of h; the rows of all hits by a transposition in registers ---
     hu, hv, square = times(h, u), times(h, v), plus(times(u, u), times(v, v))
     moments = (h, hu, hv, times(hu, u), times(hu, v), times(hv, v), times(hu, square), times(hv, square))
     turned = cgutils.alloca_once(builder, ir.ArrayType(FLOAT8, LANES))
     for k, row in enumerate(_transpose8(builder, moments)):
         builder.store(row, builder.gep(turned, [ir.Constant(I32, 0), ir.Constant(I32, k)]))
     ray = load(builder, ray_gradients, FLOAT8)
-    counting = ir.Constant(FLOAT8, [0.0, 1.0, *[0.0] * 6])
+    counting = ir.Constant(FLOAT8, [0.0, 1.0, *[0.0] * 6])  # word 9, COUNT
     slots = builder.inttoptr(slots, I32.as_pointer())
     weights = builder.inttoptr(weights, FLOAT.as_pointer())
     with cgutils.for_range(builder, count) as loop:

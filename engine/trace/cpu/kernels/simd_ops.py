@@ -30,6 +30,7 @@ def prefix_scan(
 def shift_lanes(builder: ir.IRBuilder, vector: Vector, offset_lanes: int, fill_value: float) -> Vector:
     """Move lane k to lane k + ``offset_lanes``; ``fill_value`` enters."""
     fill = ir.Constant(vector.value.type, [float(fill_value)] * LANES)
+    # LANES names the first lane of the fill
     places = [k - offset_lanes if 0 <= k - offset_lanes < LANES else LANES for k in range(LANES)]
     order = ir.Constant(ir.VectorType(I32, LANES), places)
     return Vector(builder, builder.shuffle_vector(vector.value, fill, order))
@@ -56,6 +57,7 @@ def first_lanes_mask(builder: ir.IRBuilder, count: ir.Value) -> ir.Value:
 
 def key_indices(builder: ir.IRBuilder, key: ir.Value, valid: ir.Value) -> ir.Value:
     """Return the lower halves of the keys, 0 where they are not valid."""
+    # invalid lanes may hold anything: index 0 keeps their gather inside the array
     lower = builder.and_(key, ir.Constant(LONG8, [0xFFFFFFFF] * LANES))
     return builder.select(valid, lower, ir.Constant(LONG8, [0] * LANES))
 
@@ -83,6 +85,7 @@ def gather(builder: ir.IRBuilder, address: ir.Value, indices: ir.Value, kind: ir
 
 def load(builder: ir.IRBuilder, address: ir.Value, kind: ir.Type) -> ir.Value:
     """Return a vector of that kind from an address."""
+    # rows of arrays are aligned to their elements only
     return builder.load(builder.inttoptr(address, kind.as_pointer()), align=4)
 
 
@@ -126,6 +129,7 @@ class CompressedStore:
             store(builder, self.compress(value), address)
             return
         four = ir.VectorType(DOUBLE, 4)
+        # four doubles at a time: AVX2 has no 64-bit permutation by a vector of lanes
         for first, bits in ((0, self.low_bits), (4, self.high_bits)):
             half = builder.shuffle_vector(
                 value, ir.Constant(DOUBLE8, ir.Undefined),

@@ -61,6 +61,7 @@ def eval_sh16(typingctx: TypingContext, sh: Address, basis: Address) -> Intrinsi
         parts = [
             Vector(builder, _shuffle(builder, total.value, [first, first + 1, first + 2, first]))
             for first in range(0, 12, CHANNELS)
+            # lanes are r, g, b of four harmonics in turn: add the four
         ]
         found = parts[0] + parts[1] + parts[2] + parts[3]
         values = [

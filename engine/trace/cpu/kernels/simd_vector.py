@@ -84,7 +84,7 @@ class Vector:
         kind = self.value.type
         width = 64 if kind.element == DOUBLE8.element else 32
         integers = ir.VectorType(ir.IntType(width), kind.count)
-        no_sign = ir.Constant(integers, [(1 << (width - 1)) - 1] * kind.count)
+        no_sign = ir.Constant(integers, [(1 << (width - 1)) - 1] * kind.count)  # all bits but the sign
         bits = self.builder.and_(self.builder.bitcast(self.value, integers), no_sign)
         return Vector(self.builder, self.builder.bitcast(bits, self.value.type))
 
@@ -178,6 +178,7 @@ def exp_float32(builder: ir.IRBuilder, x: Vector) -> Vector:
     p = r * 1.9875691500e-4 + 1.3981999507e-3
     for term in (8.3334519073e-3, 4.1665795894e-2, 1.6666665459e-1, 5.0000001201e-1, 1.0, 1.0):
         p = p * r + term
+    # n as the exponent's bits of 2^n
     bits = builder.shl(builder.bitcast(moved.value, integers), ir.Constant(integers, [23] * count))
     bits = builder.add(bits, ir.Constant(integers, [127 << 23] * count))
     return p * Vector(builder, builder.bitcast(bits, x.value.type))
@@ -247,6 +248,7 @@ def ellipses_in_frustum(
             height = centre[0] * n[0] + centre[1] * n[1] + centre[2] * n[2] + room
             u = legs[0] * n[0] + legs[1] * n[1] + legs[2] * n[2]
             v = legs[3] * n[0] + legs[4] * n[1] + legs[5] * n[2]
+            # the centre is outside by more than its legs reach
             outside = (height < 0.0) & (height * height > u * u + v * v)
             inside = ~outside if inside is None else inside & ~outside
         assert inside is not None
@@ -270,6 +272,7 @@ def lowest_bit(typingctx: TypingContext, mask: int) -> Intrinsic:
     def codegen(
         context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
     ) -> ir.Value:
+        # a zero mask is undefined: one instruction less
         return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
 
     return signature, codegen

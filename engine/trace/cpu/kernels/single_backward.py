@@ -75,6 +75,7 @@ def backward_ray(
     alphas, distances, hit_rgb = hits.alphas, hits.distances, hits.rgb
     weights = hit_gradients.weights
     feature_count = features.shape[1]
+    # --- front to back: weights, and the hit at the median depth ---
     transmittance = 1.0
     median = -1
     for k in range(counts[r]):
@@ -101,7 +102,7 @@ def backward_ray(
         weight = np.float64(weights[out])
         g_weight = g0 * hit_rgb[e, 0] + g1 * hit_rgb[e, 1] + g2 * hit_rgb[e, 2]
         gt = 0.0
-        transmittance_before = weight / alpha
+        transmittance_before = weight / alpha  # alpha is above exp(-q / 2) inside the octagon
         if output_gradients.has_geometry:
             g_weight += gd * distances[e]
             gt = gd * weight
@@ -168,6 +169,7 @@ def hit_in_frame(
     a0, a1, a2 = axis_u
     b0, b1, b2 = axis_v
     inverse = 1.0 / (d0 * n0 + d1 * n1 + d2 * n2)
+    # o + t d, the hit, from the mean
     t = -(x * n0 + y * n1 + z * n2) * inverse
     x += t * d0
     y += t * d1

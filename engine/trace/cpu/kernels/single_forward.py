@@ -89,6 +89,7 @@ def write_ray_query(
         ray[axis] = origin[axis]
         ray[4 + axis] = direction[axis]
     ray[3], ray[7], ray[RAY_TFAR] = t_near * T_NEAR_SCALE, np.float32(0.0), t_far * T_FAR_SCALE
+    # mask -1 sees all geometry; ids and flags as rtcInit functions leave them
     ray_i32[9], ray_i32[10], ray_i32[11] = -1, 0, 0
     ray_i32[17], ray_i32[18], ray_i32[19] = -1, -1, -1
     context_i32[0], context_i32[1] = -1, -1
@@ -120,7 +121,7 @@ def trace_rays_worker(
             break
         ray, ray_i32, context, context_i32, context_f64 = chunk_context(embree, chunk, scene.primitives)
         context_f64[PRUNE_BELOW], context_f64[ALPHA_MAX] = prune_below, limits.alpha_max
-        place, before = 0, -2
+        place, before = 0, -2  # no ray has number -1
         for s in range(chunk * rays_per_chunk, min(len(ray_indices), (chunk + 1) * rays_per_chunk)):
             r = ray_indices[s]
             if r != before + 1:
@@ -134,7 +135,7 @@ def trace_rays_worker(
             front = init_ray_state(forward, r, place)
             context[LAST_T], context_i32[LAST_ID], context[T_MAX] = t_min, INT32_MAX, t_max
             context[T_BACKFACE_CULL] = ray_t_backface_cull(rays, r, limits)
-            stop = not t_min < t_max
+            stop = not t_min < t_max  # a ray without length is not given to Embree
             while not stop:
                 write_ray_query(ray, ray_i32, context_i32, origin, direction, context[LAST_T], t_max)
                 context_i32[COUNT], context_i32[BUFFER_FULL] = 0, 0
@@ -143,6 +144,7 @@ def trace_rays_worker(
                     embree.function, embree.scene, ray.ctypes.data, embree.arguments[chunk].ctypes.data
                 )
                 gathered = context_i32[COUNT]
+                # the buffer held all hits, or what it holds already ends the ray
                 stop = context_i32[BUFFER_FULL] == 0 or context_f64[TRANSMITTANCE] < prune_below
                 for k in range(gathered):
                     i = context_i32[HIT_ID + k]
@@ -159,6 +161,7 @@ def trace_rays_worker(
                     if ends:
                         stop = True
                         break
+                # go on behind the last hit gathered
                 if not stop:
                     context[LAST_T] = context[HIT_T + gathered - 1]
                     context_i32[LAST_ID] = context_i32[HIT_ID + gathered - 1]
@@ -206,7 +209,7 @@ def write_ray_transmittance(
             context[LAST_T], context[T_MAX] = ray_limits(rays, r)
             context[T_BACKFACE_CULL] = ray_t_backface_cull(rays, r, limits)
             context_f64[TRANSMITTANCE] = 1.0
-            if context[LAST_T] < context[T_MAX]:
+            if context[LAST_T] < context[T_MAX]:  # Embree's rays must not be inside out
                 write_ray_query(ray, ray_i32, context_i32, origin, direction, context[LAST_T], context[T_MAX])
                 call_with_three_pointers(
                     embree.function, embree.scene, ray.ctypes.data, embree.arguments[chunk].ctypes.data

@@ -52,6 +52,7 @@ def eval_color(
     sh: Float32[np.ndarray, "n k 3"], i: int, basis: Float64[np.ndarray, " k"]
 ) -> tuple[float, float, float]:
     """Return display color max(0, 1/2 + sum_k sh[i, k] basis[k]) of Gaussian ``i``, three float64."""
+    # all sixteen: vectors of float32; fewer are summed one by one
     if sh.shape[1] == HARMONICS:
         red, green, blue = eval_sh16(sh.ctypes.data + i * SH_BYTES, basis.ctypes.data)
         return max(0.5 + red, 0.0), max(0.5 + green, 0.0), max(0.5 + blue, 0.0)
@@ -188,5 +189,6 @@ def mean_gradient(
             gy -= e * 2.0 * x * y + f * 2.0 * y * z + g * 6.0 * x * y
             gz += b * x * y + c * 8.0 * y * z + d * (6.0 * zz - 3.0 * xx - 3.0 * yy)
             gz += e * 8.0 * x * z + f * (xx - yy)
+    # dv/dm = (I - v v^T) / distance
     along = gx * x + gy * y + gz * z
     return (gx - along * x) * scale, (gy - along * y) * scale, (gz - along * z) * scale
