@@ -120,6 +120,7 @@ def create_app(settings: ServiceSettings | None = None) -> FastAPI:
     mount_pages(app)
     add_problem_handlers(app)
     extend_openapi(app)
+    # From the inside out: what is added last sees a request first.
     app.add_middleware(AuditMiddleware)
     app.add_middleware(JsonBoundsMiddleware, more_values={scene_previews.PREFIX: scene_previews.MAX_VALUES})
     app.add_middleware(

@@ -25,6 +25,7 @@ class AuditMiddleware(HttpMiddleware):
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, and send its response once it is recorded."""
+        # request.state of the routes is this very dictionary.
         state = scope.setdefault("state", {})
         is_recorded = False
 
@@ -65,4 +66,5 @@ async def _write_entry(scope: Scope, status: int, location: str | None) -> None:
                 status=status,
             )
     except (psycopg.Error, PoolTimeout) as error:
+        # The change is made, so that its answer goes out all the same.
         logger.warning("%s %s was not written down: %s", scope["method"], scope["path"], error)

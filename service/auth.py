@@ -76,6 +76,7 @@ async def authenticate(
     request: Request,
     service: ServiceDep,
     bearer: Annotated[HTTPAuthorizationCredentials | None, Security(_bearer)],
+    # Only for the OpenAPI document, as the name of the cookie depends on whether there is TLS.
     _described: Annotated[str | None, Security(_cookie)],
 ) -> Principal:
     """Return the principal of a request.
@@ -115,6 +116,7 @@ async def authenticate_token(request: Request, service: Service, secret: str) ->
     if service.login_throttle.is_refused(address):
         detail = "Too many wrong tokens came from this address; try again in a moment."
         raise ProblemError(429, "too-many-guesses", detail, retry_seconds=_THROTTLE_RETRY_SECONDS)
+    # Only the first one of a while is recorded, or guesses would fill the table.
     if await service.login_throttle.delay_failure(address):
         async with service.pool.connection() as connection:
             await add_entry(connection, address=address, action="wrong token", status=401)

@@ -131,6 +131,7 @@ def _stored_response(
     if path is not None and (is_small or ranges is not None or request.method == "HEAD"):
         return _StoredFileResponse(path, ranges, media_type, headers)
     start, stop, status = 0, size, 200
+    # Several ranges of a remote content are answered with all of it, as RFC 9110 allows.
     if ranges is not None and len(ranges) == 1:
         start, stop = ranges[0]
         status = 206
@@ -187,6 +188,7 @@ class _StoredFileResponse(FileResponse):
         self._ranges = ranges
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        # FileResponse parses the header once more, so that it gets the ranges as they were read here.
         headers = [pair for pair in scope["headers"] if pair[0] not in (b"range", b"if-range")]
         if self._ranges is not None:
             text = ",".join(f"{start}-{stop - 1}" for start, stop in self._ranges)

@@ -92,6 +92,7 @@ class EventBroker:
                 logger.info("not hearing of events for a moment: %s", error)
             except Exception:
                 logger.exception("listening to events failed and is begun again")
+            # Notifications may have been missed, so that all streams look by themselves.
             self._wake_all()
             await asyncio.sleep(_RECONNECT_SECONDS)
 

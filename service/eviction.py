@@ -63,6 +63,7 @@ class SpaceEvictor:
     def evict_if_low_later(self) -> None:
         """Evict unreferenced contents in the background if space is low; called after deletions."""
         task = asyncio.create_task(self._evict_if_low())
+        # The event loop itself holds tasks weakly only.
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 

@@ -42,6 +42,7 @@ async def create_once(
     """
     if key is None:
         return await create(), True
+    # The row is inserted before its object is made, as a twin waits for the lock of that row.
     placeholder = uuid.UUID(int=0)
     cursor = await connection.execute(
         """

@@ -66,6 +66,7 @@ def limits_by_path(kind: JobKind, settings: ServiceSettings) -> dict[str, int]:
         options = kind.resolve({})
     except ValueError:  # something has to be given
         return {}
+    # What follows from several options is the limit of none of them.
     numbers = [
         demand
         for demand in kind.resource_demands(options, ())
@@ -74,6 +75,7 @@ def limits_by_path(kind: JobKind, settings: ServiceSettings) -> dict[str, int]:
     return {
         demand.path: settings.ceilings[demand.resource]
         for demand in numbers
+        # Its demand is the square of the option.
         if demand.path != "train.ssim_patch_side"
     }
 

@@ -97,6 +97,7 @@ def find_excess(body: bytes, max_values: int = MAX_VALUES) -> tuple[str, str] | 
     rest = b" ".join([*pieces, body[end:]])
     if _LONG_NUMBER.search(rest) is not None:
         return "too_long_number", f"A number has more than {MAX_NUMBER_DIGITS} digits."
+    # Each value but the outermost one follows a comma or an opening bracket.
     structure = rest.translate(None, _NOT_STRUCTURE)
     if sum(structure.count(each) for each in (b",", b"[", b"{")) > max_values:
         return too_many
@@ -107,6 +108,7 @@ def find_excess(body: bytes, max_values: int = MAX_VALUES) -> tuple[str, str] | 
             if len(room) > MAX_DEPTH + 1:
                 return "too_deep", f"The request is nested deeper than {MAX_DEPTH} levels."
         elif token in _ENDS:
+            # A text that closes more than it opens is left to the parser, which refuses it.
             if len(room) > 1:
                 room.pop()
         else:

@@ -53,6 +53,7 @@ class ConnectionTable:
             ranked = sorted(self._by_client.values(), key=len, reverse=True)
             if not any(_close_longest_waiting(group) for group in ranked):
                 return False
+        # A dictionary in the place of a set, as it keeps the order.
         of_client[connection] = None
         self._count += 1
         return True

@@ -48,6 +48,7 @@ class LoginThrottle:
         is_first = client.wrong == 1
         client.waiting += 1
         try:
+            # The bound keeps the power from growing without end; it is far above the longest delay.
             await asyncio.sleep(min(MAX_DELAY_SECONDS, self._seconds * 1.5 ** min(client.wrong - 1, 40)))
         finally:
             client.waiting -= 1
@@ -55,6 +56,7 @@ class LoginThrottle:
 
     def _attempts_of_client(self, address: str) -> _ClientAttempts:
         group = client_group(address)
+        # Put at the end again: the addresses that were quiet for longest are forgotten first.
         client = self._clients.pop(group, None)
         if client is None or (not client.waiting and time.monotonic() - client.last > RESET_SECONDS):
             client = _ClientAttempts()

@@ -92,6 +92,7 @@ class BodyLimitMiddleware:
         async def send_as_problem(message: Message) -> None:
             nonlocal replaced
             is_start = message["type"] == "http.response.start"
+            # The library answers in plain text.
             if is_start and message["status"] == 413 and _PLAIN_TEXT_HEADER in message["headers"]:
                 replaced = True
                 await ProblemError(413, "too-large", "The request is too long.").response()(
@@ -154,6 +155,7 @@ _SECURITY_HEADERS = (
 
 
 def _is_cross_site(headers: Headers) -> bool:
+    # A page of another port or subdomain is same-site, and still not one of ours.
     if headers.get("sec-fetch-site") in ("cross-site", "same-site"):
         return True
     origin = headers.get("origin")

@@ -28,7 +28,7 @@ def decode_cursor(cursor: str | None) -> str | None:
     if cursor is None:
         return None
     try:
-        padded = cursor + "=" * (-len(cursor) % 4)
+        padded = cursor + "=" * (-len(cursor) % 4)  # encode_cursor leaves it out
         place = base64.b64decode(padded, altchars=b"-_", validate=True).decode()
         if "\0" in place:
             raise ValueError("no place has a NUL")
@@ -51,6 +51,7 @@ def decode_number_cursor(cursor: str | None) -> int | None:
     place = decode_cursor(cursor)
     if place is None:
         return None
+    # More digits may be above the largest bigint of the database.
     if not (place.isascii() and place.isdigit() and len(place) < 19):
         raise ProblemError(422, "cursor", "The cursor is none that this service gave out.")
     return int(place)

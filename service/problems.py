@@ -183,6 +183,7 @@ def problem_from_error(error: OctasplatError) -> ProblemError:
         return not_found_error(error.kind)
     if isinstance(error, ConflictError):
         return ProblemError(409, "conflict", detail)
+    # Single kinds of StorageError, before all others below.
     if isinstance(error, StorageFullError):
         return ProblemError(507, "storage-full", shorten_absolute_paths(detail), retry_seconds=again)
     if isinstance(error, ContentTooLargeError):

@@ -68,6 +68,7 @@ def _parse_x_forwarded(headers: Headers) -> list[dict[str, str]]:
     count = max(len(values) for values in lists.values())
     hops: list[dict[str, str]] = [{} for _ in range(count)]
     for key, values in lists.items():
+        # Lists of different lengths are aligned at their ends, where the last proxy has written.
         for place, hop in enumerate(hops):
             if len(values) == 1 and key != "for":
                 hop[key] = values[0]

@@ -53,10 +53,13 @@ class _FrontEndServer(uvicorn.Server):
         """Start the server, call ``on_start`` and print the address."""
         asyncio.get_running_loop().set_exception_handler(log_loop_error)
         await super().startup(sockets)
+        # asyncio has one number for both backlogs; connections may wait in a longer queue than is accepted at
+        # once.
         for listener in sockets or ():
             listener.listen(_LISTEN_BACKLOG)
         if self.started:
             self.on_start()
+            # octasplat serve waits for this line.
             sys.stdout.write(f"{self.address}\n")
             sys.stdout.flush()
 
@@ -116,6 +119,7 @@ def main() -> int:
         log = logging.getLogger("uvicorn.error")
         log.setLevel(logging.WARNING)
         log.addFilter(RepeatedMessages())
+        # Such an error is told below in one sentence, so that uvicorn's traceback is left out.
         log.addFilter(lambda _record: _startup_error(app) is None)
         # What is there for good is not looked through again by each full collection, with the loop held.
         gc.collect()

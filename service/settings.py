@@ -237,4 +237,5 @@ def secret_bits(secret: str) -> float:
     for pattern, alphabet in _ALPHABETS:
         if re.fullmatch(pattern, secret):
             return len(secret) * math.log2(alphabet)
+    # Any other text is taken for base64.
     return len(secret) * math.log2(64)

@@ -46,5 +46,6 @@ async def run_in_pool(
     purpose: ThreadPurpose, function: Callable[..., T], /, *values: object, **named: object
 ) -> T:
     """Call a blocking function in a thread of the pool for ``purpose``; as :func:`asyncio.to_thread`."""
+    # With the context, as lines of the log name the request that it holds.
     call = functools.partial(contextvars.copy_context().run, function, *values, **named)
     return await asyncio.get_running_loop().run_in_executor(_POOLS[purpose], call)

@@ -36,7 +36,9 @@ def stream_zip(entries: Iterable[ZipEntry], modified_at: datetime) -> Iterator[b
     with zipfile.ZipFile(sink, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
         for entry in entries:
             info = zipfile.ZipInfo(entry.name, time)
+            # The permissions of Unix are in the upper 16 bits.
             info.external_attr = 0o644 << 16
+            # Nothing can go back to the header, so that its form is chosen by the length that is known.
             is_large = entry.size_bytes >= _LARGE_BYTES
             with archive.open(info, "w", force_zip64=is_large) as file:
                 for piece in entry.read():

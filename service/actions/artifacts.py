@@ -39,6 +39,7 @@ async def get_job_with_artifacts(
         found = await rows.artifacts_of(connection, job_id)
     if not found:
         raise not_found_error("result")
+    # Before the answer begins, as nothing can be told from within a ZIP file.
     await run_in_pool(ThreadPurpose.DOWNLOADS, lambda: [service.storage.stat(row.sha256) for row in found])
     return job, found
 

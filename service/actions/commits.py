@@ -40,6 +40,7 @@ async def request_commit(service: Service, principal: Principal, dataset_id: uui
     check_not_draining(service)
     async with service.pool.connection() as connection, connection.transaction():
         owner = (await fetch_visible_dataset(connection, principal, dataset_id)).owner
+        # The owner's lock comes before the row's, see workers.db.locks.
         await lock_owner(connection, owner)
         dataset = await fetch_visible_dataset(connection, principal, dataset_id, lock=True)
         if dataset.state == "committed":
@@ -89,6 +90,7 @@ async def _validate(
 async def _renew_check(service: Service, check: rows.Check) -> None:
     """Renew the validation regularly; without that it counts as abandoned."""
     while True:
+        # Several tries may fail before the validation counts as abandoned.
         await asyncio.sleep(rows.STALE_CHECK_SECONDS / 6)
         with suppress(psycopg.Error, PoolTimeout):
             async with service.pool.connection() as connection:

@@ -66,6 +66,7 @@ async def new_task(
 ) -> DatasetTask:
     """Add a task; it is taken at once where a place is free, as soon as the transaction has ended."""
     task = await rows.add_task(connection, dataset.id, dataset.owner, kind, request)
+    # After a moment, as nobody sees the row before the caller's transaction ends.
     asyncio.get_running_loop().call_later(_FIRST_LOOK_SECONDS, service.task_added.set)
     return task
 

@@ -31,6 +31,7 @@ async def create_dataset(
             await check_new_dataset(connection, principal.owner, service.settings.quota)
             return (await rows.create_dataset(connection, principal.owner, new.name, new.holds)).id
 
+        # A request that does not say what the dataset holds is the same as one for photographs.
         request = fingerprint("dataset", new.model_dump(exclude=set() if new.holds == "files" else {"holds"}))
         dataset_id, _ = await create_once(connection, principal, idempotency_key, request, make)
         return await fetch_visible_dataset(connection, principal, dataset_id)

@@ -86,6 +86,7 @@ async def _stream_events(
     checked_at = time.monotonic()
     with service.event_broker.subscribe(job_id, principal.owner, address) as news:
         while not service.event_broker.is_closing:
+            # Before the events are read, so that one that comes meanwhile wakes the stream again.
             news.clear()
             async with service.pool.connection() as connection:
                 if time.monotonic() - checked_at >= _ACCESS_CHECK_SECONDS:
@@ -95,6 +96,7 @@ async def _stream_events(
                 job = await get_job(connection, job_id)
                 if job is None or not principal.may_see(job.owner):
                     return  # it was deleted, which ends the stream
+                # Before the events are read, so that the last ones are among them.
                 over = job.is_over
                 events = await list_job_events(connection, job_id, after, _PAGE_SIZE)
             for event in events:

@@ -83,6 +83,7 @@ async def run_import(service: Service, task: DatasetTask) -> TaskOutcome:
     owner = Principal(task.owner, frozenset({"write"}), task.id)
     async with _opened(service, owner, new.url) as answer:
         text = answer.headers.get("content-length", "")
+        # The length of an encoded body is not that of the file.
         length = int(text) if text.isdigit() and "content-encoding" not in answer.headers else None
         upload = Upload(_body(answer), sha256=new.sha256, size_bytes=length)
         return TaskOutcome(await uploads.store_named(service, owner, task.dataset_id, new.path, upload))

@@ -129,6 +129,7 @@ async def change_job(
     async with service.pool.connection() as connection, connection.transaction():
         job = await fetch_visible_job(connection, principal, job_id, lock=True)
         check(JobWithView(job, await job_view(connection, service, principal, job)))
+        # A label that is null is removed, and one that was not sent stays.
         given = change.model_dump(exclude_unset=True)
         job = await rows.change_job(
             connection,
@@ -186,6 +187,7 @@ async def delete_job(
     if cancel and not job.is_over:
         detail = "The job is being stopped; repeat the request in a moment."
         raise ProblemError(409, "stopping", detail, retry_seconds=BUSY_RETRY_SECONDS)
+    # In another transaction, so that the job stays stopped where its deletion is refused.
     async with service.pool.connection() as connection:
         await rows.delete_job(connection, job_id)
     service.evictor.evict_if_low_later()

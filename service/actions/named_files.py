@@ -37,6 +37,7 @@ async def check_named_files(
     if files_id is not None:
         if not kind.takes_files:
             raise input_problem("files_id", f"Jobs of the kind {kind.name} take no files.")
+        # Locked, so that it is not deleted before the new job refers to it.
         dataset = await get_dataset(connection, files_id, lock=True)
         if dataset is None or not principal.may_see(dataset.owner):
             raise input_problem("files_id", "There is no such dataset.")

@@ -135,6 +135,7 @@ async def continue_upload(
             service.evictor.upload_lease(left) as lease,
             aclosing(receive_parts(service.storage, body, max_bytes=left, limits=limits)) as parts,
         ):
+            # Each part counts by itself, so that a break loses only what came after the last one.
             async for blob in parts:
                 part = UploadPart(offset_bytes, blob.sha256, blob.size_bytes)
                 async with lease.reference({blob.sha256}) as connection:

@@ -214,6 +214,7 @@ async def _check_source(connection: Connection, principal: Principal, requested:
     if new.dataset_id is not None and not kind.takes_other_photographs:
         detail = f"The kind {kind.name} works on source_id alone, a finished job."
         raise input_problem("dataset_id", detail)
+    # Locked, so that it is not deleted before the new job refers to it.
     source = await rows.get_job(connection, new.source_id, lock=True)
     if source is None or not principal.may_see(source.owner):
         raise input_problem("source_id", "There is no such job.")
@@ -294,6 +295,7 @@ async def _revised_options(
     if request.options:
         revised = await revise_options(kind, revised, request.options, is_resumed=is_resumed)
     options = revised.complete
+    # Also where nothing is changed: workers and limits may be others than when the job was accepted.
     check_formats_writable(kind, options, job.queue, workers)
     await check_named_files(connection, principal, kind, options, job.files_id)
     sizes = await photograph_sizes(connection, job.dataset_id) if job.dataset_id is not None else []

@@ -196,6 +196,7 @@ async def _check_storage(service: Service) -> str:
         )
     try:
         async with asyncio.timeout(STORAGE_TIMEOUT_SECONDS):
+            # Shielded, as other requests wait for the same check.
             return await asyncio.shield(service.storage_check)
     except TimeoutError:
         return "unreachable"

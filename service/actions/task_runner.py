@@ -129,6 +129,7 @@ class TaskRunner:
                 await self._record(task, outcome)
                 return
             except OctasplatError as error:
+                # The changes of the outcome are refused, and that is how the task ends.
                 outcome = TaskOutcome(problem=problem_from_error(error))
                 continue
             except _DATABASE_ERRORS:
@@ -142,6 +143,7 @@ class TaskRunner:
         async with self._service.pool.connection() as connection, connection.transaction():
             await outcome.apply(connection)
             if not await rows.end_task(connection, task, result=outcome.result, problem=problem):
+                # Another process has the task, and nothing of what was applied may stay.
                 raise psycopg.Rollback
 
 

@@ -277,6 +277,7 @@ async def _limited_by_quota(receive: Callable[[], Awaitable[ReceivedT]], bytes_l
     try:
         return await receive()
     except ContentTooLargeError as error:
+        # Of the two limits the error names the one that was exceeded.
         if bytes_left is None or error.max_bytes != bytes_left:
             raise
         raise QuotaExceededError(

@@ -36,6 +36,7 @@ async def create_webhook(
             owner = principal.owner
             if new.job_id is not None:
                 owner = (await fetch_visible_job(connection, principal, new.job_id)).owner
+            # The owner's lock comes before the row of the job, see workers.db.locks.
             await lock_owner(connection, owner)
             if new.job_id is not None:
                 await fetch_visible_job(connection, principal, new.job_id, lock=True)

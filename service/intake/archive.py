@@ -267,6 +267,7 @@ def _check_place(record: ZipEntry) -> None:
     except FileNameError as error:
         if error.code in _LEADING_ELSEWHERE:
             raise_intake_error(error.code, str(error), record.name)
+    # Some programs deflate folders too, and deflate makes two bytes of nothing.
     if record.name.endswith("/") and (record.size_bytes or record.packed_bytes > 2):
         raise_intake_error(
             "archive-mismatch", f"The folder {quoted_name(record.name)} has a content.", record.name
@@ -275,6 +276,7 @@ def _check_place(record: ZipEntry) -> None:
 
 def _copy_entry(file: BinaryIO, entry: ArchiveFile, writer: BlobWriter) -> None:
     record, name = entry.record, quoted_name(entry.record.name)
+    # Without the header of zlib, which entries do not have.
     inflate = zlib.decompressobj(-zlib.MAX_WBITS) if record.method == DEFLATED else None
     checksum = count = 0
     left = record.packed_bytes
@@ -291,6 +293,7 @@ def _copy_entry(file: BinaryIO, entry: ArchiveFile, writer: BlobWriter) -> None:
             piece, pending = pending, b""
         else:
             try:
+                # At most so much at a time, so that a bomb does not fill the memory.
                 piece = inflate.decompress(pending, _PIECE_BYTES)
             except zlib.error:
                 raise_intake_error(

@@ -209,6 +209,7 @@ def _check_masks(
     warnings: list[str],
 ) -> int:
     """Check masks against their photographs, whose names they have with ``.png`` at the end."""
+    # File systems differ in whether they compose the characters of a name.
     photographs = {unicodedata.normalize("NFC", path): size for path, size in sizes.items()}
     masks = [file.path for file in files if file_role(file.path) is FileRole.MASK]
     alone = 0

@@ -21,8 +21,9 @@ _PIECE_BYTES = 1 << 20
 _MAX_BYTES = 256 << 20
 _MAX_SEGMENTS = 100_000
 _READ_ERRORS = (OSError, ValueError, LookupError, ArithmeticError, struct.error)
+# Rows of a block by compression: none, RLE, ZIPS, ZIP, PIZ, PXR24, B44, B44A, DWAA, DWAB.
 _EXR_ROWS = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 9: 256}
-_TIFF_LAYOUTS = {3: "H", 4: "I", 16: "Q"}
+_TIFF_LAYOUTS = {3: "H", 4: "I", 16: "Q"}  # SHORT, LONG, LONG8
 
 
 def check_complete(file: BinaryIO, name: str, kind: str) -> None:
@@ -80,7 +81,7 @@ def _first_scan_offset(file: BinaryIO) -> int:
             continue
         (length,) = unpack_struct(file, ">H")
         file.seek(length - 2, os.SEEK_CUR)
-        if byte == 0xDA:
+        if byte == 0xDA:  # start of scan
             return file.tell()
         marked = False
     raise ValueError("no scan")
@@ -88,6 +89,7 @@ def _first_scan_offset(file: BinaryIO) -> int:
 
 def _is_png_complete(file: BinaryIO, size_bytes: int) -> bool:
     """Return whether the end chunk is there."""
+    # The end chunk is 12 bytes: a length of zero, its name and a checksum.
     file.seek(max(0, size_bytes - 12))
     if file.read(12)[4:8] == b"IEND":
         return True
@@ -96,7 +98,7 @@ def _is_png_complete(file: BinaryIO, size_bytes: int) -> bool:
         length, kind = unpack_struct(file, ">I4s")
         if kind == b"IEND":
             return True
-        file.seek(length + 4, os.SEEK_CUR)
+        file.seek(length + 4, os.SEEK_CUR)  # its data and checksum
     return True
 
 
@@ -110,10 +112,11 @@ def _is_bmp_complete(file: BinaryIO, size_bytes: int) -> bool:
     """Return whether all rows are there, where they are not compressed."""
     head = file.read(34)
     (start,) = struct.unpack_from("<I", head, 10)
+    # An older header, whose fields have other places.
     if struct.unpack_from("<I", head, 14)[0] < 40:
         return True
     width, height, _, bits, compression = struct.unpack_from("<2i2HI", head, 18)
-    if compression not in (0, 3):
+    if compression not in (0, 3):  # none, or masks of bits
         return True
     return bool(size_bytes >= start + abs(height) * ((width * bits + 31) // 32 * 4))
 
@@ -122,7 +125,7 @@ def _is_tiff_complete(file: BinaryIO, size_bytes: int) -> bool:
     """Return whether all strips or tiles of the first page lie within the file."""
     order = "<" if file.read(2) == b"II" else ">"
     (version,) = unpack_struct(file, f"{order}H")
-    big = version == 43
+    big = version == 43  # BigTIFF
     file.seek(8 if big else 4)
     address = f"{order}{'Q' if big else 'I'}"
     (start,) = unpack_struct(file, address)
@@ -134,6 +137,7 @@ def _is_tiff_complete(file: BinaryIO, size_bytes: int) -> bool:
         for tag, kind, number, inline in fields
         if tag in (273, 279, 324, 325) and kind in _TIFF_LAYOUTS
     }
+    # StripOffsets and StripByteCounts, TileOffsets and TileByteCounts.
     for offsets, lengths in ((273, 279), (324, 325)):
         ends = zip(values.get(offsets, ()), values.get(lengths, ()), strict=False)
         if any(offset + length > size_bytes for offset, length in ends):
@@ -157,7 +161,7 @@ def _tiff_values(file: BinaryIO, layout: str, number: int, inline: bytes, addres
 def _is_exr_complete(file: BinaryIO, size_bytes: int) -> bool:
     """Return whether all blocks of rows lie within the file, where it has one part without tiles."""
     _, flags = unpack_struct(file, "<2I")
-    if flags & (0x200 | 0x800 | 0x1000):
+    if flags & (0x200 | 0x800 | 0x1000):  # tiled, deep, of several parts
         return True
     rows, compression = 0, 0
     while name := read_null_terminated(file):

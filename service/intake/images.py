@@ -159,6 +159,7 @@ class _BoundedFile(io.RawIOBase):
     def read(self, size: int | None = -1) -> bytes:
         requested = -1 if size is None else size
         if requested < 0 or requested > self._bytes_left:
+            # One more than is left, by which _charge_read notices that there are more.
             requested = self._bytes_left + 1
         data = self._file.read(requested)
         self._charge_read(len(data))
@@ -198,6 +199,7 @@ def _read_webp_size(file: Any) -> tuple[int, int, int]:
     if chunk == b"VP8X":
         flags, width, height = head[20], head[24:27], head[27:30]
         is_animated = flags & 0x02
+        # Each side less one, in 24 bits.
         sizes = (1 + int.from_bytes(side, "little") for side in (width, height))
         return next(sizes), next(sizes), 2 if is_animated else 1
     if chunk == b"VP8L" and head[20] == 0x2F:
@@ -213,7 +215,7 @@ def _read_tiff_size(file: Any) -> tuple[int, int, int]:
     """Return the size of the first page, the only one that counts."""
     order = "<" if file.read(2) == b"II" else ">"
     (version,) = unpack_struct(file, f"{order}H")
-    if version == 43:
+    if version == 43:  # BigTIFF
         file.seek(8)
         (start,) = unpack_struct(file, f"{order}Q")
         file.seek(start)
@@ -226,7 +228,7 @@ def _read_tiff_size(file: Any) -> tuple[int, int, int]:
     for _ in range(min(count, 65_535)):
         tag, kind = unpack_struct(file, f"{order}2H")
         values, field = unpack_struct(file, f"{order}Q8s" if version == 43 else f"{order}I4s")
-        if tag in (256, 257):
+        if tag in (256, 257):  # ImageWidth, ImageLength
             if values != 1:
                 raise ValueError("several sizes")
             layout = {1: "B", 3: "H", 4: "I", 16: "Q"}[kind]
@@ -270,6 +272,7 @@ def _read_hdr_size(file: Any) -> tuple[int, int, int]:
     if size is None or size[2] == size[5]:
         raise ValueError("no size")
     first, second = int(size[3]), int(size[6])
+    # The axis that is named first is the slower one; with X first the image is stored by columns.
     return (first, second, 1) if size[2] == b"X" else (second, first, 1)
 
 

@@ -142,6 +142,7 @@ async def receive_body(stream: AsyncIterator[bytes], writer: BlobWriter, limits:
             await run_in_pool(ThreadPurpose.UPLOADS, writer.write, bytes(pending))
         return await run_in_pool(ThreadPurpose.UPLOADS, writer.commit)
     except BaseException:
+        # In a thread and shielded, as a thread may be writing right now, for which abort waits.
         await asyncio.shield(run_in_pool(ThreadPurpose.UPLOADS, writer.abort))
         raise
 

@@ -32,6 +32,7 @@ def read_end(file: BinaryIO, length: int) -> EndRecord:
     Raises:
         IntakeError: there is none, it is damaged, or the archive has several parts.
     """
+    # The record lies before a comment of at most MAX_COMMENT bytes.
     tail_start = max(0, length - END_LAYOUT.size - MAX_COMMENT)
     file.seek(tail_start)
     tail = file.read(length - tail_start)
@@ -83,6 +84,7 @@ def _read_end_64(file: BinaryIO, where: int, must_end: int, short: tuple[int, in
     signature, length, _, _, disk, directory_disk, here, entries, size, start = _END_64_LAYOUT.unpack(
         file.read(_END_64_LAYOUT.size)
     )
+    # The length leaves out the signature and itself.
     if signature != b"PK\x06\x06" or length != _END_64_LAYOUT.size - 12:
         raise_intake_error("archive-damaged", "The ZIP64 record of the archive is damaged; write it anew.")
     if disk or directory_disk or here != entries:

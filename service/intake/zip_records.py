@@ -249,6 +249,7 @@ def _check_coverage(file: BinaryIO, records: list[ZipEntry], directory_start: in
 
 def _is_descriptor(data: bytes, length: int, record: ZipEntry) -> bool:
     facts = (record.crc32, record.packed_bytes, record.size_bytes)
+    # Programs write it in 32 or 64 bits, with or without a signature.
     for layout in ("<3I", "<I2Q"):
         for signature in (b"PK\x07\x08", b""):
             if length == len(signature) + struct.calcsize(layout) and data[: len(signature)] == signature:

@@ -45,4 +45,4 @@ def open_signed_in(api: "Api") -> None:
         path = Path(folder) / "open.html"
         path.write_text(_PAGE.format(link=link), encoding="ascii")
         if webbrowser.open(path.as_uri()):
-            time.sleep(_PAGE_OPEN_SECONDS)
+            time.sleep(_PAGE_OPEN_SECONDS)  # the browser reads the file after it has started

@@ -64,6 +64,7 @@ def _number_range(kind: type, marks: Sequence[Any]) -> Any:
     high: Any = None
     low_open = high_open = False
     for mark in marks:
+        # A Field within Annotated has its marks in itself.
         for part in getattr(mark, "metadata", None) or (mark,):
             if isinstance(part, annotated_types.Ge):
                 low = part.ge

@@ -59,6 +59,7 @@ def request_options(model: type[BaseModel], *, exclude: Sequence[str] = ()) -> C
     decorators += [_former_option(flag, fields[name]) for flag, name in _former_flags(model, fields).items()]
 
     def decorate(command: Command) -> Command:
+        # What is decorated last comes first in the help.
         for decorator in reversed(decorators):
             command = decorator(command)
         return command
@@ -107,6 +108,7 @@ def request_from_options(model: type[Any], given_values: dict[str, Any]) -> Any:
     values = {
         name: value
         for name, value in _by_new_flags(model, given_values).items()
+        # An option that may be repeated is () where it was not given.
         if value is not None and not (value == () and _may_repeat(model.model_fields[name]))
     }
     check_inputs(model, values)  # some requests look into their source, with much to import

@@ -33,6 +33,7 @@ def cpu_features(cpuinfo: Path = Path("/proc/cpuinfo")) -> tuple[str, ...]:
         lines = cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
         return ()
+    # "flags" on x86-64 and "Features" on ARM.
     flags = next((line.partition(":")[2] for line in lines if line.startswith(("flags", "Features"))), "")
     known = set(flags.split())
     return tuple(feature for feature in _FEATURES if feature in known)

@@ -154,6 +154,7 @@ class Api:
                 self._has_answered = True
                 return self._raise_for_status(response)
             self._has_answered = self._has_answered or _is_from_service(response)
+            # A service that has answered is waited for longer than one that perhaps is not there.
             patience.seconds = self.new_backoff().seconds
             if not patience.wait(_retry_after(response)):
                 return self._raise_for_status(response)
@@ -196,6 +197,7 @@ class Api:
             ServiceUnreachableError: a proxy says that the service is away.
         """
         if not response.is_success:
+            # The body of a streamed answer is not there before it is read.
             response.read()
             self._raise_for_status(response)
         self._has_answered = True

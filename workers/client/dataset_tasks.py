@@ -45,6 +45,7 @@ def commit(api: Api, dataset: dict[str, Any]) -> dict[str, Any]:
         try:
             response = api.post_response(f"{address}/commit")
         except ServiceError as error:
+            # 409: a front end of the former version is checking the dataset.
             if error.status != 409:
                 raise
             dataset = api.get(address)

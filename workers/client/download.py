@@ -158,13 +158,16 @@ def _resume_download(
 ) -> None:
     begin = _file_size(partial)
     if begin >= artifact["size_bytes"]:
+        # No request, as an empty result has no byte to ask for.
         partial.touch()
         return
+    # Compressed, the offsets would not be those of the file.
     headers = {"Accept-Encoding": "identity"}
     if begin:
         headers |= {"Range": f"bytes={begin}-", "If-Range": f'"{artifact["sha256"]}"'}
     with api.stream("GET", address, headers=headers) as response:
         api.raise_for_stream_status(response)
+        # Only if the rest is of the same content, see If-Range; else all of it comes.
         is_partial = response.status_code == 206
         with partial.open("ab" if is_partial else "wb") as handle:
             for piece in response.iter_bytes():

@@ -75,6 +75,7 @@ def send_resumable(
         else:
             reached, task = int(response.headers["Upload-Offset"]), response.headers.get("Location")
         if reached > offset:
+            # An outage after progress is a new one, with all of its time.
             patience = api.new_backoff()
         offset = reached
     wait_for_task(api, api.get(task))

@@ -171,6 +171,7 @@ def _find_or_create_dataset(
     """Return the dataset that was made for just these files, or a new one."""
     digest = hashlib.sha256(f"{holds}\0{name}".encode() if holds == "files" else name.encode())
     for file in files:
+        # In the place of contents, whose digests would take a while to compute before anything is shown.
         facts = file.path.stat()
         digest.update(f"{file.name}\0{facts.st_size}\0{facts.st_mtime_ns}\0{facts.st_ino}\n".encode())
     body = {"name": name, "holds": holds} if holds == "files" else {"name": name}
@@ -192,6 +193,7 @@ def _send_missing(
 ) -> None:
     there = {f["path"]: f for f in api.iterate_pages(f"/v1/datasets/{dataset_id}/files", "files", limit=5000)}
     names = {file.name for file in files}
+    # What an earlier try has sent and the folder does not hold any more.
     for path in there.keys() - names:
         try:
             api.request("DELETE", _file_address(dataset_id, path))
@@ -272,6 +274,7 @@ class _ProgressCounter:
         try:
             yield tell
         finally:
+            # send() counts the whole file when it is there.
             tell(0)
 
     def add(self, count: int) -> None:

@@ -82,6 +82,7 @@ def _read_events(api: Api, job_id: str, last: str) -> Iterator[tuple[str, dict[s
                 data += value
             elif name == "id":
                 number = value
+            # An empty line ends an event of the stream.
             elif not line and data:
                 yield kind, json.loads(data), number
                 kind, data = "message", ""

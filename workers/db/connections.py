@@ -169,6 +169,7 @@ async def _set_timeouts(connection: Connection) -> None:
         "tcp_keepalives_interval": str(KEEPALIVES["keepalives_interval"]),
         "tcp_keepalives_count": str(KEEPALIVES["keepalives_count"]),
     }
+    # Outside of a transaction, as a rollback would undo the settings.
     await connection.set_autocommit(True)
     await _set_known_settings(connection, settings, is_local=False)
     await connection.set_autocommit(False)

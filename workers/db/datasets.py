@@ -100,6 +100,7 @@ async def list_files_by_suffix(
             ),
             [owner, [f"%{ending}" for ending in suffixes], limit],
         )
+        # The condition is evaluated first, and takes out the column that Dataset has no field for.
         return [(Dataset(**row), path) for row in await cursor.fetchall() if (path := row.pop("file_path"))]
 
 
@@ -195,6 +196,7 @@ async def files_of(
     connection: Connection, dataset_id: uuid.UUID, *, after: str = "", limit: int | None = None
 ) -> list[DatasetFile]:
     """Return at most ``limit`` files of a dataset after the path ``after``, by path."""
+    # By bytes, which is Python's order of paths too, whatever the locale of the database.
     return await fetch_all(
         connection,
         DatasetFile,

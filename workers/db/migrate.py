@@ -91,6 +91,7 @@ def _acquire_lock(connection: psycopg.Connection) -> None:
         DatabaseError: somebody else has it for too long.
     """
     deadline = time.monotonic() + MAX_WAIT_SECONDS
+    # Polled, as pg_advisory_lock would wait without an end.
     while connection.execute("SELECT pg_try_advisory_lock(%s)", [_LOCK]).fetchone() != (True,):
         if time.monotonic() > deadline:
             raise DatabaseError(
@@ -208,6 +209,7 @@ def _is_newer(connection: psycopg.Connection, applied: set[tuple[str, str]]) -> 
     reach = None
     if connection.execute("SELECT to_regclass('schema_reach') IS NOT NULL").fetchone() == (True,):
         reach = connection.execute("SELECT oldest_reader FROM schema_reach").fetchone()
+    # Names of steps begin with padded numbers, so that they sort in the order of the steps.
     if (
         reach is None
         or missing_migrations(applied)

@@ -166,6 +166,7 @@ async def check_new_dataset(connection: Connection, owner: str, default: Quota =
     quota = await _locked_quota(connection, owner, default)
     if quota.max_datasets is None:
         return
+    # Counts no further than the limit, however many rows there are.
     query = "SELECT count(*) AS n FROM (SELECT 1 FROM datasets WHERE owner = %s LIMIT %s) AS found"
     if await _query_number(connection, query, [owner, quota.max_datasets]) >= quota.max_datasets:
         raise QuotaExceededError(
@@ -197,6 +198,7 @@ async def check_new_job(connection: Connection, owner: str, default: Quota = NO_
 
 async def _locked_quota(connection: Connection, owner: str, default: Quota) -> Quota:
     quota = await quota_of(connection, owner, default)
+    # Without any limit there is nothing to compare, and nobody has to wait.
     if quota != NO_QUOTA:
         await lock_owner(connection, owner)
     return quota

@@ -10,6 +10,8 @@ from octasplat.workers.storage.fsck import Reference
 async def references(connection: Connection) -> AsyncIterator[Reference]:
     """Return the references of datasets, uploads, results, checkpoints, previews and live scenes."""
     async with connection.transaction():
+        # Named cursors stay on the server and send rows in parts, as the tables may be larger than the
+        # memory.
         async with connection.cursor("dataset_files") as cursor:
             await cursor.execute("SELECT dataset_id, path, sha256, size_bytes FROM dataset_files")
             async for row in cursor:

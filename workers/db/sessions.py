@@ -79,6 +79,7 @@ async def add_link(connection: Connection, token_id: uuid.UUID) -> str:
 
 async def use_link(connection: Connection, secret: str) -> uuid.UUID | None:
     """Use a link and return its token; None if it was used, has expired, or never existed."""
+    # In one statement, so that of two requests with the same link only one gets the row.
     cursor = await connection.execute(
         "DELETE FROM sign_in_links WHERE sha256 = %s RETURNING token_id, expires_at > now() AS fresh",
         [hash_secret(secret)],

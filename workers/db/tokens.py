@@ -88,6 +88,7 @@ async def add_environment_token(connection: Connection, secret: str) -> Token:
         Its row; one that was revoked stays so, and then nothing is changed.
     """
     async with connection.transaction():
+        # One process at a time: two with different tokens would revoke each other's.
         await connection.execute("SELECT pg_advisory_xact_lock(%s)", [_LOCK])
         token = await add_token(connection, secret, owner="admin", name="OCTASPLAT_TOKEN", scopes=["admin"])
         if token.revoked_at is None:

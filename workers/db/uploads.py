@@ -103,6 +103,7 @@ async def add_part(connection: Connection, upload: FileUpload, part: UploadPart)
         ConflictError: another part begins there, as by another connection, or the upload is gone.
     """
     await lock_owner(connection, upload.owner)
+    # Only where the part begins at the end of what has come: of two connections one changes no row.
     cursor = await connection.execute(
         """
         UPDATE uploads SET offset_bytes = offset_bytes + %s, expires_at = now() + make_interval(hours => %s)

@@ -33,6 +33,7 @@ from octasplat.workers.storage.trees import read_manifest
 
 FORMAT = 1
 BACKUP_FILE, TABLES_PREFIX, STORE_FOLDER = "backup.json", "tables-", "store"
+# What migrate writes by itself, and what processes write that do not run where it is restored.
 _EXCLUDED_TABLES = ("schema_steps", "schema_reach", "workers", "storing", "removing_contents")
 _CONTENTS_QUERY = """
     SELECT sha256 FROM dataset_files UNION SELECT sha256 FROM artifacts
@@ -136,6 +137,7 @@ def create_backup(
         "format": FORMAT, "version": __version__, "folder": rows.name,
         "steps": steps, "tables": tables, "sequences": sequences, "lacks": sorted(copied.faults),
     }  # fmt: skip
+    # Last, as until then the folder still is the earlier backup.
     with translate_os_errors(folder):
         write_json(folder / BACKUP_FILE, record)
         for earlier in folder.glob(f"{TABLES_PREFIX}*"):
@@ -167,6 +169,7 @@ def restore_backup(
     known = {step.name for step in all_migrations() if step.component == OWN_COMPONENT}
     if not known.issuperset(record["steps"]):
         raise BackupError(f"{folder} was made by a newer version ({record['version']}); install that one.")
+    # The steps that the rows were written under; later ones change the rows together with the tables.
     migrate(conninfo, only=record["steps"])
     with psycopg.connect(conninfo) as connection:
         if connection.execute("SELECT EXISTS (TABLE datasets) OR EXISTS (TABLE jobs)").fetchone() != (False,):
@@ -227,6 +230,7 @@ def _write_table(connection: psycopg.Connection, name: str, folder: Path) -> dic
             sql.SQL("COPY {} ({}) TO STDOUT").format(*_table_identifiers(name, columns))
         ) as copy:
             for piece in copy:
+                # COPY writes one line for each row, and escapes line ends within values.
                 rows += bytes(piece).count(b"\n")
                 handle.write(piece)
         handle.flush()
@@ -288,6 +292,7 @@ def _copy_store(
     for name in documents:
         document = source.read_document(name)
         if document is not None and not target.publish_document(name, document):
+            # An earlier backup holds another document of that name.
             target.remove_document(name)
             target.publish_document(name, document)
     return _Copied(len(digests) - len(faults), size_bytes, faults)

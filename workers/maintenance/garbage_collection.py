@@ -144,6 +144,7 @@ async def _collect(
     async with pool.connection() as connection:
         await _expire_stale_leases(connection)
         async with connection.transaction():
+            # One snapshot, so that the leases and the references are those of one moment.
             await connection.execute("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ")
             began_unix = await _oldest_lease_unix(connection)
             named, entered = await _referenced_contents(connection)

@@ -135,6 +135,7 @@ async def update_expiry_times(connection: Connection, retention: Retention) -> N
 
 async def delete_expired(connection: Connection) -> DeletedCounts:
     """Delete what has expired; its contents stay in the store until they are collected."""
+    # Jobs first, as a dataset stays for as long as there are jobs on it.
     jobs = [
         await _delete_expired_job(connection, job_id) for job_id in await _expired_ids(connection, "jobs")
     ]

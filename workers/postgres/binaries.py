@@ -95,5 +95,6 @@ def _major_of(folder: Path) -> int | None:
         )
     except (OSError, subprocess.SubprocessError):
         return None
+    # "postgres (PostgreSQL) 16.4 (Debian 16.4-1)", where distributions add the last part.
     match = re.search(r"\) (\d+)", answer.stdout)
     return int(match.group(1)) if match else None

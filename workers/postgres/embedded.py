@@ -148,6 +148,7 @@ class EmbeddedPostgres:
             (self.home / "run").mkdir(exist_ok=True)
             for folder in (self.home / "run", self._socket_folder()):
                 folder.mkdir(exist_ok=True, mode=0o700)
+                # Everybody may write to /tmp, and make this folder there before us.
                 facts = folder.lstat()
                 if folder.is_symlink() or facts.st_uid not in (os.geteuid(), user.uid):
                     raise DatabaseError(f"{folder} belongs to somebody else; remove it and start again.")
@@ -178,6 +179,7 @@ class EmbeddedPostgres:
         """Return the folder that a server which runs has written down beside its number."""
         pid_file = self.cluster / "postmaster.pid"
         try:
+            # The fifth line of postmaster.pid is the folder of its socket.
             line = pid_file.read_text(encoding="utf-8", errors="surrogateescape").split("\n")[4]
         except (OSError, IndexError):
             return None
@@ -317,6 +319,7 @@ class EmbeddedPostgres:
                     stdin=subprocess.DEVNULL,
                     stdout=output,
                     stderr=subprocess.STDOUT,
+                    # A Ctrl+C in the terminal does not reach the server, which is stopped after its clients.
                     start_new_session=True,
                     timeout=START_SECONDS + 30,
                     check=False,

@@ -130,6 +130,7 @@ class Attempt:
                 """,
                 [as_json(dict(manifest)), is_progress, job.id],
             )
+            # After the update, whose bytes the triggers of the database have counted by now.
             await check_bytes(connection, job.owner, self.quota)
             event = {key: manifest[key] for key in ("stage", "step") if key in manifest}
             await add_event(connection, job.id, job.attempt, "checkpoint", event)
@@ -342,6 +343,7 @@ async def claim(pool: Pool, job_id: uuid.UUID, entry_id: int, worker: str) -> At
             """,
             [worker, job_id],
         )
+        # The order of turns in fair_share; not now(), which is the time at which the transaction began.
         await connection.execute(
             """
             INSERT INTO owner_turns (owner, queue) VALUES (%s, %s)
@@ -349,6 +351,7 @@ async def claim(pool: Pool, job_id: uuid.UUID, entry_id: int, worker: str) -> At
             """,
             [job.owner, job.queue],
         )
+        # ``job`` is the row as it was before the update.
         await add_event(connection, job_id, job.attempt + 1, "state", {"state": "running", "worker": worker})
         await trim_log(connection, job_id, MAX_EARLIER_LOG_LINES)
         await add_log_lines(connection, job_id, job.attempt + 1, [f"Attempt {job.attempt + 1}"])

@@ -19,6 +19,7 @@ from octasplat.workers.queue.protocol import JobQueue
 _MAX_CANDIDATES = 30
 _MAX_JOBS_PER_OWNER = 4
 """Further jobs of an owner are tried where other workers are just taking the first."""
+# ``owners`` is a loose index scan, one look-up an owner; DISTINCT would read every queued job.
 _FAIR_ORDER = """
     WITH RECURSIVE owners AS (
         (SELECT owner FROM jobs WHERE state = 'queued' AND queue = %(queue)s ORDER BY owner LIMIT 1)
@@ -64,6 +65,7 @@ async def choose_job(
         chosen = await _next_fair_job(connection, job_queue, job)
         if chosen is None or chosen.slip is None:
             return job_id, entry_id
+        # The delivered entry is used up whichever job begins, so that its own job needs another.
         await requeue_job(
             connection, job_queue, job, keep_entry=True, without_event=True, reason=job.waits_for
         )
@@ -80,9 +82,12 @@ async def _next_fair_job(connection: Connection, job_queue: JobQueue, job: Job) 
         if row["id"] == job.id:
             return None
         async with connection.cursor(row_factory=class_row(Job)) as locking:
+            # Another worker may be taking the row right now, and waiting for it would take longer than the
+            # next one.
             query = "SELECT {} FROM jobs WHERE id = %s AND state = 'queued' FOR UPDATE SKIP LOCKED"
             await locking.execute(select_columns(query, Job), [row["id"]])
             other = await locking.fetchone()
+        # An entry that is being delivered is left to the worker that has it.
         if (
             other is not None
             and other.slip is not None

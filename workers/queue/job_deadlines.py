@@ -77,6 +77,7 @@ async def fail_abandoned_jobs(
     ended = []
     for job in found:
         async with pool.connection() as connection, connection.transaction():
+            # Nothing was locked when the jobs were found, and a worker may have taken one since.
             now = await get_job(connection, job.id, lock=True)
             if now is None or now.state != "queued" or now.slip != job.slip:
                 continue
@@ -102,6 +103,7 @@ async def fail_before_start(
 ) -> bool:
     """Fail a job whose entry is being delivered, before an attempt; False if it has continued meanwhile."""
     async with connection.transaction():
+        # Without the row's lock, which comes after the owner's, see workers.db.locks.
         job = await get_job(connection, job_id)
         if job is not None and drop_checkpoint:
             await lock_owner(connection, job.owner)  # whose bytes get fewer

@@ -92,6 +92,7 @@ async def _count_same_losses(connection: Connection, job: Job, error: Mapping[st
             SELECT data FROM job_events WHERE job_id = %s AND kind = 'rescued' ORDER BY id DESC LIMIT %s
         ) AS lost WHERE data->>'type' = %s
         """,
+        # Progress sets ``rescues`` to 0, so that so many of the newest rows are those since then.
         [job.id, job.rescues, error.get("type")],
     )
     row = await cursor.fetchone()

@@ -35,6 +35,7 @@ _NEWEST_JOBS: LiteralString = (
     + _MATCHING
     + "ORDER BY id DESC LIMIT %(limit)s"
 )
+# All keys ascend, so that one comparison of rows begins the next page; jobs without a value get 1: last.
 _KEYS: LiteralString = """
     CASE WHEN %(order)s = 'name' THEN
         lower(coalesce(label, (SELECT d.name FROM datasets AS d WHERE d.id = jobs.dataset_id), kind))
@@ -110,6 +111,7 @@ async def create_job(connection: Connection, job_queue: JobQueue, new: NewJob) -
                 as_json_or_null(new.estimate), new.files_id, as_json_or_null(new.requested),
             ],
         )  # fmt: skip
+        # What a new job uses is not about to expire any more.
         for dataset_id in filter(None, (new.dataset_id, new.files_id)):
             await connection.execute(
                 "UPDATE datasets SET used_at = now(), expires_at = NULL WHERE id = %s", [dataset_id]
@@ -175,6 +177,7 @@ async def queue_position(connection: Connection, job: Job) -> int | None:
     """Return how many jobs go before a queued job in its queue, if owners take turns; None for any other."""
     if job.state != "queued":
         return None
+    # Each other owner has a turn before each of this owner's jobs, the first only if it queued earlier.
     cursor = await connection.execute(
         """
         WITH waiting AS (
@@ -243,6 +246,7 @@ async def retry_job(
         NotFoundError: there is no such job.
     """
     async with connection.transaction():
+        # The owner's lock comes before the row's, see workers.db.locks.
         await lock_owner(connection, (await _get_job_or_raise(connection, job_id)).owner)
         job = await _get_job_or_raise(connection, job_id, lock=True)
         if job.state not in ("failed", "canceled"):

@@ -12,6 +12,7 @@ from octasplat.workers.db.connections import Connection, Pool
 from octasplat.workers.queue.protocol import DeliveryCallback, NewEntry
 
 TASK_NAME = "octasplat.run_job"
+# An id of 62 bits below zero: 50 of the first id and 12 that count returns, see requeued_entry_id.
 _MAX_REQUEUES = 4096
 _FIRST_REQUEUED_ID = -(1 << 62)
 
@@ -41,6 +42,7 @@ class ProcrastinateQueue:
         self._stale_seconds = stale_seconds
         self._poll_seconds = poll_seconds
         self._listen = listen
+        # Never opened: it is only given connections of the callers' transactions.
         self._manager = JobManager(procrastinate.PsycopgConnector())
         self._workers: set[Worker] = set()
         self._stopped = False
@@ -115,13 +117,14 @@ class ProcrastinateQueue:
             fetch_job_polling_interval=self._poll_seconds,
             abort_job_polling_interval=60.0,  # jobs are cancelled by their own table
             listen_notify=self._listen,
-            delete_jobs="always",
-            install_signal_handlers=False,
+            delete_jobs="always",  # how jobs ended is in our own table
+            install_signal_handlers=False,  # the worker process has its own
             update_heartbeat_interval=self._heartbeat_seconds,
             stalled_worker_timeout=self._stale_seconds,
         )
         self._workers.add(worker)
         try:
+            # stop() may have been called before there was a worker to stop.
             if not self._stopped:
                 await worker.run()  # type: ignore[no-untyped-call]
         finally:

@@ -37,6 +37,7 @@ class StalledAttempts:
         """Return the stalled attempts that have not changed since they were first found, long enough ago."""
         now = time.monotonic()
         found = {(job.id, job.attempt, job.heartbeat_at): job for job in stale}
+        # What was heard of again is forgotten, so that its time begins anew.
         self._since = {key: self._since.get(key, now) for key in found}
         return [job for key, job in found.items() if now - self._since[key] >= self._wait_seconds]
 
@@ -84,6 +85,7 @@ async def recover_stalled_jobs(
         async with connection.transaction():
             for job_id in await job_queue.orphaned_jobs(connection):
                 again = await get_job(connection, job_id, lock=True)
+                # If it got another entry meanwhile, requeue_job replaces that one.
                 if again is not None and again.state == "queued":
                     logger.warning("job %s had no slip in the queue and got a new one", job_id)
                     await requeue_job(connection, job_queue, again)

@@ -110,6 +110,7 @@ class StorageLease:
 
     async def _check_held(self, connection: Connection, *, lock: bool) -> None:
         query = "SELECT id FROM storing WHERE id = %s"
+        # Held until the references are written, as expire_stale_leases skips locked rows.
         cursor = await connection.execute(f"{query} FOR KEY SHARE" if lock else query, [self.id])
         if await cursor.fetchone() is None:
             raise StorageUnavailableError(
@@ -132,6 +133,7 @@ async def storage_lease(pool: Pool, storage: Storage) -> AsyncIterator[StorageLe
         yield note
     finally:
         renewal.cancel()
+        # Also where the block was canceled, else the row would hold back the collection until it is stale.
         await asyncio.shield(_release(pool, note))
 
 

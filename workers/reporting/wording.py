@@ -5,6 +5,7 @@ from octasplat.engine.core.events import HeldOutMeasured, TrainingProgress
 
 def format_rate(per_second: float) -> str:
     """Return a rate with its thousands shortened: ``870``, ``310k``, ``1.25M``."""
+    # From here on thousands would be rounded to 1000k.
     if per_second >= 999_500:
         return f"{per_second / 1e6:.2f}M"
     return f"{per_second / 1e3:.0f}k" if per_second >= 1000 else f"{per_second:.0f}"

@@ -25,6 +25,7 @@ MAX_PROCESSES = 256
 _MAX_THREADS = 4096
 _EXTRA_MEMORY_BYTES = 4 << 30
 """The worker stops a program that needs more memory than it may; this ends what grows too fast for it."""
+# The number of capset(2) by processor, and _LINUX_CAPABILITY_VERSION_3.
 _CAPSET = {"x86_64": 126, "aarch64": 91}
 _CAPABILITY_VERSION = 0x20080522
 
@@ -52,6 +53,7 @@ def confine(
         restrict_folders(hidden, writable=writable, readable=readable)
     with contextlib.suppress(OSError):
         _drop_capabilities()
+    # Last, as the filter refuses calls that the steps above need.
     with contextlib.suppress(OSError):
         install_seccomp_filter(may_start_processes=may_start_processes)
 
@@ -94,4 +96,5 @@ def _drop_capabilities() -> None:
     capset = _CAPSET.get(os.uname().machine)
     if capset is not None:
         header = _CapabilityHeader(_CAPABILITY_VERSION, 0)
+        # Effective, permitted and inheritable sets, of two words each: all empty.
         syscall(capset, ctypes.byref(header), ctypes.byref((ctypes.c_uint32 * 6)()))

@@ -26,6 +26,7 @@ def _hides_processes(mounts: Path) -> bool:
     """Return whether ``/proc`` is mounted with hidepid; ``mounts`` is as ``/proc/self/mountinfo``."""
     with contextlib.suppress(OSError):
         lines = mounts.read_text(encoding="utf-8", errors="replace").splitlines()
+        # The fifth word is where it is mounted; of several mounts at one place the last one counts.
         of_proc = [line for line in lines if line.split()[4:5] == ["/proc"]]
         return bool(of_proc) and re.search(r"\bhidepid=(?!0|off)", of_proc[-1]) is not None
     return False

@@ -129,6 +129,7 @@ def become_user(uid: int, home: Path) -> None:
     os.environ[CACHE_VARIABLE] = str(shared_cache_folder())
     os.environ.update(HOME=str(home), USER=str(uid), LOGNAME=str(uid))
     os.environ.pop("XDG_CACHE_HOME", None)
+    # The user id last: only root may change the groups.
     os.setgroups([])
     os.setresgid(uid, uid, uid)
     os.setresuid(uid, uid, uid)

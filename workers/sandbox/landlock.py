@@ -20,6 +20,7 @@ _EXECUTE, _WRITE_FILE, _READ_FILE, _READ_FOLDER = 1, 2, 4, 8
 _REFER, _TRUNCATE, _DEVICE_IOCTL = 1 << 13, 1 << 14, 1 << 15
 _SCOPES = 0b11
 """Neither signals to processes outside nor sockets without a name in the file system; from version 6."""
+# The bits that each version knows: up to REFER, TRUNCATE from 3 on, IOCTL_DEV from 5 on.
 _RIGHTS_BY_VERSION = ((2, (1 << 14) - 1), (3, (1 << 15) - 1), (5, (1 << 16) - 1))
 _FILE_RIGHTS = _EXECUTE | _WRITE_FILE | _READ_FILE | _TRUNCATE | _DEVICE_IOCTL
 _DEVICES = Path("/dev")
@@ -64,6 +65,7 @@ def restrict_folders(
         raise OSError(errno.ENOSYS, "the kernel has no Landlock of use")
     rights = max(mask for least, mask in _RIGHTS_BY_VERSION if version >= least)
     attributes = _Ruleset(rights, 0, _SCOPES if version >= 6 else 0)
+    # 8 bytes are the first field alone, which is all that is asked of kernels before version 6.
     length = ctypes.sizeof(attributes) if version >= 6 else 8
     ruleset = syscall(_CREATE, ctypes.byref(attributes), ctypes.c_size_t(length), ctypes.c_uint32(0))
     try:
@@ -79,6 +81,7 @@ def restrict_folders(
         for paths, given in ((writable, rights), (readable, reading)):
             for path in paths:
                 _add_rule(ruleset, Path(os.path.realpath(path)), given)
+        # Else the kernel restricts only processes with CAP_SYS_ADMIN.
         prctl(PR_SET_NO_NEW_PRIVS, 1)
         syscall(_RESTRICT, ctypes.c_int(ruleset), ctypes.c_uint32(0))
     finally:

@@ -20,6 +20,7 @@ def prctl(option: int, value: int = 0, pointer: object = 0) -> None:
     Raises:
         OSError: the kernel refuses, or this is not Linux.
     """
+    # As wide as a register: prctl is variadic, and an int may leave the upper half undefined.
     _call_libc(
         ctypes.c_int, "prctl", option, ctypes.c_ulong(value), pointer, ctypes.c_ulong(0), ctypes.c_ulong(0)
     )

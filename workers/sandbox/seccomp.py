@@ -29,11 +29,15 @@ from octasplat.workers.sandbox.system_calls import (
 )
 
 _MODE_FILTER = 2
+# SECCOMP_RET_ALLOW, SECCOMP_RET_ERRNO and SECCOMP_RET_KILL_PROCESS.
 _ALLOW, _ERRNO, _KILL = 0x7FFF0000, 0x00050000, 0x80000000
 _REFUSE, _ABSENT = _ERRNO | errno.EPERM, _ERRNO | errno.ENOSYS
+# BPF: LD|W|ABS, JMP|JEQ, JMP|JGE, JMP|JSET, ALU|AND and RET, all with a constant.
 _LOAD, _EQUAL, _AT_LEAST, _ANY_BIT, _MASK, _RETURN = 0x20, 0x15, 0x35, 0x45, 0x54, 0x06
+# Places in struct seccomp_data, whose arguments begin at byte 16.
 _NUMBER_OFFSET, _ARCH_OFFSET = 0, 4
 _X32_SYSCALL_BIT = 0x40000000
+# AUDIT_ARCH_X86_64 and AUDIT_ARCH_AARCH64.
 _ARCHES = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
 _CLONE_THREAD, _CLONE_PARENT, _CLONE_NEW = 0x00010000, 0x00008000, 0x7E020000
 """A clone that has another parent would not be counted; the last are all kinds of namespaces."""
@@ -95,6 +99,7 @@ def _filter_instructions(machine: str, may_start_processes: bool) -> Iterator[_I
     yield _Instruction(_RETURN, 0, 0, _KILL)  # calls of another processor would have other numbers
     yield _Instruction(_LOAD, 0, 0, _NUMBER_OFFSET)
     if machine == "x86_64":
+        # Calls of x32 come as ones of x86-64, but with this bit in other numbers.
         yield _Instruction(_AT_LEAST, 0, 1, _X32_SYSCALL_BIT)
         yield _Instruction(_RETURN, 0, 0, _REFUSE)
     # Its flags lie in memory, where a filter cannot read them; libraries make threads without it then.
@@ -118,6 +123,7 @@ def _filter_instructions(machine: str, may_start_processes: bool) -> Iterator[_I
     refused = REFUSED if may_start_processes else {**REFUSED, **PROCESS_CALLS}
     for calls, answer in ((allowed, _ALLOW), (refused, _REFUSE)):
         for first, last in _ranges([pair[column] for pair in calls.values()]):
+            # A number above the range skips both of the next instructions, one below it the second.
             yield _Instruction(_AT_LEAST, 2, 0, last + 1)
             yield _Instruction(_AT_LEAST, 0, 1, first)
             yield _Instruction(_RETURN, 0, 0, answer)
@@ -150,6 +156,7 @@ def _answer_call(number: int, answer: Sequence[_Instruction]) -> Iterator[_Instr
 
 def _argument(index: int) -> _Instruction:
     """Return the instruction that loads the lower half of an argument."""
+    # Both processors are little-endian, so that the lower half comes first.
     return _Instruction(_LOAD, 0, 0, 16 + 8 * index)
 
 

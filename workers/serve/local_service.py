@@ -80,6 +80,7 @@ async def serve(options: ServeOptions, on_ready: Callable[[str], Awaitable[None]
             await ensure_bootstrap_token(conninfo, settings.data / TOKEN_FILE)
             return await _run(options, database, conninfo, address_file, on_ready)
         finally:
+            # First, so that no client is sent to a service that ends.
             address_file.unlink(missing_ok=True)
             if database is not None:
                 await asyncio.to_thread(database.stop)
@@ -116,6 +117,7 @@ async def _run(
         "front end", _python_command(options, "octasplat.service.serving"), {**environment, **front}, on_line
     )
     command = _python_command(options, "octasplat", "worker", "--queues")
+    # A worker without queues takes no jobs: it recovers lost ones and does the periodic work.
     children = [api, SupervisedProcess("maintenance", (*command, "", "--name", "maintenance"), environment)]
     if options.queues:
         queues = ",".join(f"{name}={slots}" for name, slots in options.queues.items())
@@ -124,6 +126,7 @@ async def _run(
     loop = asyncio.get_running_loop()
 
     def leave() -> None:
+        # A second signal kills them, see SupervisedProcess.stop.
         if stop.is_set():
             for child in children:
                 child.stop()

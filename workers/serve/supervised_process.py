@@ -89,12 +89,13 @@ class SupervisedProcess:
                 cwd="/",  # nothing that lies where the user stands is to be found by chance
                 stdin=asyncio.subprocess.DEVNULL,
                 stdout=asyncio.subprocess.PIPE if self._on_line is not None else None,
+                # A Ctrl+C in the terminal reaches this process alone, which stops the others in their order.
                 start_new_session=True,
             )
         except OSError as error:
             logger.error("%s cannot be started: %s", self.name, error)
             return EXIT_NOT_STARTED
-        if self._stopping.is_set():
+        if self._stopping.is_set():  # stop() was called while it started
             self._process.terminate()
         if self._on_line is not None and self._process.stdout is not None:
             async for line in self._process.stdout:

@@ -55,6 +55,7 @@ class DiskSpace:
         Raises:
             StorageUnavailableError: a disk does not answer.
         """
+        # On a disk for both, what either of them would give up is room for each.
         if self._shares_disk():
             excluding = SpaceUsage(
                 excluding.work_bytes + excluding.store_bytes, excluding.work_bytes + excluding.store_bytes

@@ -34,6 +34,7 @@ def _empty(folder: int, top: int, depth: int) -> bool:
                 continue
             inner = _open_folder(name, folder)
             try:
+                # To the top, as each depth takes a descriptor and a part of the stack.
                 if depth == MAX_DEPTH:
                     os.rename(name, uuid.uuid4().hex, src_dir_fd=folder, dst_dir_fd=top)
                     moved = True

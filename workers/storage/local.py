@@ -37,6 +37,7 @@ from octasplat.workers.storage.verifying_writer import VerifyingWriter
 DEFAULT_FLOOR_BYTES = 2 << 30
 _CHECK_EVERY_BYTES = 16 << 20
 _PIECE_BYTES = 1 << 20
+# Another file system, one without links, or too many of them: the content is copied then.
 _LINK_ERRORS = frozenset({errno.EXDEV, errno.EPERM, errno.EMLINK, errno.ENOTSUP, errno.EACCES})
 
 
@@ -137,6 +138,7 @@ class LocalStorage:
                 facts = os.stat(aside, dir_fd=self._staging_fd, follow_symlinks=False)
                 if facts.st_mtime < before_unix:
                     return True
+                # Somebody has written it again meanwhile.
                 with suppress(FileExistsError):
                     os.link(
                         aside,
@@ -302,6 +304,7 @@ class LocalWriter(VerifyingWriter):
     def __init__(
         self, storage: LocalStorage, sha256: str | None, size_bytes: int | None, max_bytes: int | None
     ) -> None:
+        # Before super(), which discards where the announced length is too large.
         self._fd = -1
         super().__init__(sha256, size_bytes, max_bytes)
         self._storage = storage
@@ -323,6 +326,7 @@ class LocalWriter(VerifyingWriter):
     def _publish(self, blob: Blob) -> None:
         storage = self._storage
         with translate_os_errors(storage.root):
+            # Read-only, as materialise() may give other folders links to this very file.
             os.fchmod(self._fd, 0o444)
             os.fsync(self._fd)
             folder_fd = _open_folder(storage._blobs_fd, blob.sha256[:2])

@@ -12,6 +12,7 @@ FREE_SPACE_HINT = "delete datasets or jobs, whose contents then go at once, or a
 
 def is_disk_full(error: BaseException | None) -> bool:
     """Return whether an error, or its cause, is a full disk."""
+    # Bounded, as causes may refer to each other.
     for _ in range(20):
         if error is None:
             return False

@@ -79,6 +79,7 @@ def still_unreferenced(
         before_unix: only what was written before this time goes, s.
     """
     return [
+        # Just above the listed time: it stays if it was written again since.
         UnusedContent(entry.blob.sha256, entry.blob.size_bytes, math.nextafter(entry.modified_unix, math.inf))
         for entry in listed
         if entry.blob.sha256 not in referenced and entry.modified_unix < before_unix

@@ -182,6 +182,7 @@ class UntrustedFolder:
         """
         parts = name.split("/")
         if any(part in ("", ".", "..") or "\0" in part for part in parts):
+            # Refused as links are: the name leads elsewhere, or nowhere.
             raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), name)
         folder = os.dup(self._fd)
         try:

@@ -99,6 +99,7 @@ class Admission:
             job = await get_job(connection, job_id)
         if job is None or (needed := _needed_bytes(job)) <= await self._context.free_bytes():
             return True
+        # Costs later jobs a download of their photographs, so only where there is too little.
         await self._free_space()
         free = await self._context.free_bytes()
         if needed <= free:
@@ -137,6 +138,7 @@ class Admission:
         for known in (own, *facts):
             if known.get("disk_bytes") is None:
                 return None
+            # A checkpoint in a store on the same disk takes space that no eviction frees.
             capacities.append(int(known["disk_bytes"]) - (kept if known.get("shares_store_disk") else 0))
         return max(capacities)
 
@@ -174,6 +176,8 @@ async def defer_job(
 ) -> None:
     """Defer a job whose entry is being delivered by ``delay_seconds``; its owner is told the reason."""
     async with pool.connection() as connection, connection.transaction():
+        # Read under the row's lock: its owner may have canceled it, or another entry has taken this one's
+        # place.
         job = await get_job(connection, job_id, lock=True)
         if job is not None and job.state == "queued" and job.slip == entry_id:
             await requeue_job(

@@ -43,6 +43,7 @@ async def reason_incapable(pool: Pool, job_id: uuid.UUID, stale_seconds: float) 
         if job.checkpoint is None or Checkpoint.from_row(job.checkpoint).results == versions.RESULTS_VERSION:
             return None
         made_by = Checkpoint.from_row(job.checkpoint).results
+        # Left to a worker of that version only while one is alive; without any, the job begins anew here.
         for row in await live_workers(connection, stale_seconds):
             if job.queue in row.queues and row.facts.get("results", 1) == made_by:
                 return "another worker can go on from its checkpoint, which is of another version"

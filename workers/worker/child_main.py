@@ -31,6 +31,7 @@ _PAUSE_SECONDS = 0.01
 
 def main() -> NoReturn:
     """Run the job's process and end as it ends."""
+    # Blocked before the fork, so that sigwait loses none that arrives early.
     signal.pthread_sigmask(signal.SIG_BLOCK, _HANDLED)
     # Elsewhere than on Linux the program sees the end of its stdin.
     set_parent_death_signal(int(sys.argv[1]), END_SIGNAL)
@@ -39,18 +40,22 @@ def main() -> NoReturn:
     guard = os.getpid()
     program = os.fork()
     if program == 0:
+        # A group of its own for killpg, where the system has no subreapers.
         os.setpgid(0, 0)
+        # The mask is inherited, and the program has to receive SIGTERM.
         signal.pthread_sigmask(signal.SIG_UNBLOCK, _HANDLED)
         set_parent_death_signal(guard, signal.SIGKILL)
         from octasplat.workers.worker.job_process import run_job
 
         run_job()
     forbid_memory_access(is_measured=True)
+    # Copies of the pipes here would hide their end from the worker when the program ends.
     nothing = os.open(os.devnull, os.O_RDWR)
     for pipe in (0, 1, 2):
         os.dup2(nothing, pipe)
     status = _wait_for_program(program)
     status = _end_all(program, status)
+    # By the same signal as the program, as the worker reads the cause from it.
     if os.WIFSIGNALED(status):
         _end_by_signal(os.WTERMSIG(status))
     os._exit(os.waitstatus_to_exitcode(status))
@@ -65,6 +70,7 @@ def _wait_for_program(program: int) -> int | None:
         if number == signal.SIGTERM:
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.kill(program, number)
+        # SIGCHLD says only that some child ended: adopted ones arrive here too, and several make one signal.
         _, status = _reap(program)
         if status is not None:
             return status
@@ -106,6 +112,7 @@ def _end_by_signal(number: int) -> NoReturn:
         signal.signal(number, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {number})
     os.kill(os.getpid(), number)
+    # Where the signal did not end this process; 128 + number is the convention of shells.
     os._exit(128 + number)
 
 

@@ -96,6 +96,7 @@ class ChildProcess:
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.PIPE,
+            # Not in the group of the worker's terminal, whose Ctrl+C is for the worker alone.
             start_new_session=True,
             env=_with_absolute_paths(child_environment(os.environ)),
             cwd=task["folder"],
@@ -118,6 +119,7 @@ class ChildProcess:
                 self._force_end()
             await asyncio.sleep(_POLL_SECONDS)
         code = self._process.returncode
+        # A process that escaped the guard may hold the pipes; its output is not waited for.
         _, late = await asyncio.wait(self._readers, timeout=5)
         for reader in late:
             reader.cancel()
@@ -148,10 +150,11 @@ class ChildProcess:
 
     def process_count(self) -> int:
         """Return the number of live processes that the job's own has started, directly or not."""
-        return descendant_count(self._process.pid) - 1
+        return descendant_count(self._process.pid) - 1  # without the program itself, a child of the guard
 
     def _send(self, line: str) -> None:
         assert self._process.stdin is not None
+        # The child may be gone already, which its exit code tells.
         with contextlib.suppress(OSError, RuntimeError):
             self._process.stdin.write(f"{line}\n".encode())
 
@@ -186,6 +189,7 @@ class ChildProcess:
             logger.info("an event of process %d was left out: %r", self.pid, error)
 
     def _on_stderr_line(self, line: str) -> None:
+        # Progress bars overwrite their line by carriage returns; only the last state is kept.
         text = line[-4000:].split("\r")[-1].rstrip()
         if text:
             self.last_log_lines.append(text)

@@ -49,6 +49,7 @@ def reconstruct(task: Task) -> None:
 
     If that is of other settings, as another version may understand the same options, it begins anew.
     """
+    # Read before the run begins, which writes this file itself.
     has_left = (task.run / CONFIG).exists()
     try:
         _run_reconstruction(task)
@@ -111,6 +112,7 @@ def _publish_run(task: Task) -> None:
         return
     for path in sorted(task.run.rglob("*")):
         name = path.relative_to(task.run)
+        # Hidden files are previews and live scenes, which are stored on their own, or files being written.
         hidden = any(part.startswith(".") for part in name.parts)
         if path.is_file() and not hidden and name.parts[0] not in (CHECKPOINTS, CACHE):
             _publish_file(task, path, name.as_posix())
@@ -151,6 +153,7 @@ def _publish_file(task: Task, path: Path, name: str) -> None:
     """Add a file to the results without a copy."""
     target = task.results / name
     target.parent.mkdir(parents=True, exist_ok=True)
+    # os.link refuses an existing name, which an earlier call of the same attempt has left.
     target.unlink(missing_ok=True)
     if name == CONFIG:  # where the photographs lay on this machine is private
         content = json.loads(path.read_text(encoding="utf-8"))

@@ -63,6 +63,7 @@ class Heartbeat:
                 async with asyncio.timeout(settings.heartbeat_seconds):
                     state = await (self._attempt.heartbeat() if beats else self._attempt.read_state())
             except DATABASE_ERRORS:
+                # Whether the attempt is lost is decided by the clock, in wait_until_lost.
                 continue
             if beats:
                 self._last_sent = sent

@@ -56,6 +56,7 @@ class HostHealth:
 
     def record_crash(self, job_id: uuid.UUID, owner: str) -> None:
         """Record that the program of a job crashed."""
+        # By job, so that one that crashes several times counts once.
         self._crashed_jobs[job_id] = owner
         if (
             len(self._crashed_jobs) >= MAX_CRASHES
@@ -103,6 +104,7 @@ class HostHealth:
 
     async def try_recover(self) -> bool:
         """Return whether jobs can be taken again; a remaining fault is in :attr:`fault`."""
+        # After crashes there is nothing to probe, so that time alone decides.
         if time.monotonic() < self._cooldown_until:
             return False
         found = await self.check_work_folder() or await self._check_store()
@@ -121,6 +123,7 @@ class HostHealth:
             folder = self._work / "attempts"
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder) as handle:
+                # A file can be opened on a full or failing disk; only written bytes tell.
                 handle.write(b"x")
                 handle.flush()
 

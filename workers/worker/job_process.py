@@ -36,9 +36,11 @@ class _EventStream:
 
     def __init__(self) -> None:
         self._file = os.fdopen(os.dup(1), "w", encoding="utf-8")
+        # print() and C libraries write to descriptor 1, which leads to the log from here on.
         os.dup2(2, 1)
         if isinstance(sys.stdout, io.TextIOWrapper):
             sys.stdout.reconfigure(line_buffering=True)  # what is printed belongs between the stages
+        # Events come from several threads, whose lines must not mix.
         self._lock = threading.Lock()
 
     def write(self, line: dict[str, object]) -> None:
@@ -126,7 +128,7 @@ def _watch_stdin(stop: threading.Event) -> None:
     for line in sys.stdin:
         if line.strip() == "stop":
             stop.set()
-    os.kill(os.getpid(), signal.SIGKILL)
+    os.kill(os.getpid(), signal.SIGKILL)  # the end of stdin: the worker is gone
 
 
 def _raise_oom_score() -> None:

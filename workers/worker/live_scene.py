@@ -89,6 +89,7 @@ def heaviest(gaussians: FlatGaussians, count: int) -> FlatGaussians:
     rows: slice | np.ndarray = slice(None)
     if len(gaussians) > count:
         weights = gaussians.opacities * np.exp(gaussians.log_scales.sum(axis=1, dtype=np.float64))
+        # argpartition leaves no order; sorted rows keep that of the Gaussians.
         rows = np.sort(np.argpartition(-weights, count)[:count])
     return FlatGaussians(
         means_world=gaussians.means_world[rows],

@@ -83,6 +83,7 @@ class OutcomeWriter:
         except QuotaExceededError as error:
             problem = {"type": "quota", "message": f"The results cannot be stored. {error}"}
             await self._write_with_retries(lambda: self._attempt.fail(problem, discarded=results))
+            # The next attempt would take the manifest for results that were published but not recorded.
             await self._discard_published_results()
         # The machine did its work in either case: a quota is its owner's matter.
         self._context.host_health.record_success()
@@ -121,6 +122,7 @@ class OutcomeWriter:
             error: what happened.
             max_recoveries: lost attempts after which it fails.
         """
+        # No attempt follows, so that what is finished is stored now.
         if self._job.rescues >= max_recoveries:
             try:
                 await self._with_partial_results(
@@ -139,12 +141,14 @@ class OutcomeWriter:
         """Requeue the job, or fail it, after an error around its program."""
         described = _error_as_dict(error)
         if isinstance(error, StorageUnavailableError):
+            # A store that cannot be reached may be the fault of this machine, which is checked first.
             await self.diagnose_and_requeue(described["message"])
         elif isinstance(error, StorageError) and not isinstance(
             error, BlobNotFoundError | DigestMismatchError | UntrustedFileError
         ):
             await self.requeue_counted(described)
         else:
+            # Contents that are missing or damaged stay so, and another attempt would end the same way.
             await self._write_with_retries(lambda: self._attempt.fail(described))
 
     async def diagnose_and_requeue(self, message: str) -> None:
@@ -179,6 +183,7 @@ class OutcomeWriter:
             self._reporter.checkpoint_bytes,
             await asyncio.to_thread(self._workspace.peak_used_bytes),
         )
+        # Were the disk full without this job's folder and checkpoint too, the job is not to blame.
         if await self._context.space_shortage(SpaceUsage(taken, kept_bytes + taken)) is not None:
             await self._attempt.requeue(self._context.job_queue, message)
             return

@@ -38,6 +38,7 @@ class PathRedactor:
             ]
         for root in _path_patterns(work):
             names += [
+                # The folders are those of Workspace.fetch_dataset: datasets, an id, and the dataset's name.
                 (rf"{root}/datasets/[^/\s]+/[^/\s]+/", ""),
                 (rf"{root}/datasets/[^/\s]+/[^/\s\"']+", "the scene"),
                 (rf"{root}\b", "the work folder"),
@@ -74,6 +75,7 @@ def redact_json(value: Any, redactor: PathRedactor) -> Any:
 
 def _last_parts(match: re.Match[str]) -> str:
     parts = [part for part in match[0].split("/") if part]
+    # A route such as /api/jobs looks like a path, but begins with no folder of this machine.
     if parts[0] not in _top_folders():
         return match[0]
     last_parts = parts[1:][-_KEPT_PATH_PARTS:]

@@ -41,6 +41,7 @@ async def run_periodically(task: PeriodicTask) -> None:
             async with asyncio.timeout(max(task.timeout_seconds, 10 * task.interval_seconds)):
                 await task.action()
             failures = 0
+        # Before DATABASE_ERRORS, which TimeoutError is among.
         except TimeoutError as error:
             failures += 1
             logger.error("%s did not end in time and is begun again: %s", name, error)

@@ -63,6 +63,7 @@ class PreviewRenderer:
         began = time.monotonic()
         if began < self._next_at:
             return
+        # A view that is held out shows how the scene looks where nothing was fitted.
         chosen = int((dataset.test_indices if len(dataset.test_indices) else dataset.train_indices)[0])
         rays = grid_rays(dataset, chosen, self._side_px)
         # A learnt background alone: materials would send rays of their own, which takes time.
@@ -74,6 +75,7 @@ class PreviewRenderer:
         wait = INTERVAL_SECONDS if self._image_count > 1 else FIRST_INTERVAL_SECONDS
         self._next_at = began + max(wait, 2 * spent)
         if spent > 0:
+            # The time is that of the pixels, so that it grows with the square of the side.
             fitting_px = self._side_px * math.sqrt(MAX_TIME_FRACTION * INTERVAL_SECONDS / spent)
             self._side_px = int(min(MAX_SIDE_PX, max(MIN_SIDE_PX, fitting_px)))
 

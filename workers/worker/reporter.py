@@ -184,6 +184,7 @@ class Reporter:
                 async with self._flushing:
                     await self._flush()
             except FencedError:
+                # Another attempt has the job, and nothing of this one may be written any more.
                 return
             except _IGNORED_ERRORS as error:
                 logger.info("progress of job %s was not written: %s", self._attempt.job.id, error)
@@ -191,6 +192,7 @@ class Reporter:
                 logger.exception("progress of job %s was not written", self._attempt.job.id)
 
     async def _flush(self) -> None:
+        # Taken before the writes: what cannot be written is dropped and does not delay what follows.
         progress, self._progress = self._progress, None
         events, self._events = tuple(self._events), deque(maxlen=_MAX_PENDING_EVENTS)
         lines, self._lines = tuple(self._lines), []
@@ -230,6 +232,7 @@ class Reporter:
             if live_scene is not None:
                 await self._store_live_scene(live_scene)
         except asyncio.CancelledError:
+            # Pending again, so that finish() stores what was interrupted.
             self._wanted_checkpoint, self._preview = (
                 self._wanted_checkpoint or pending,
                 self._preview or preview,
@@ -238,6 +241,7 @@ class Reporter:
         except (StorageError, *_IGNORED_ERRORS) as error:
             logger.warning("checkpoint of job %s was not stored: %s", self._attempt.job.id, error)
             self.add_note(f"Warning: a checkpoint could not be stored: {error}")
+            # Tried again with the next wish to store, unless that is for a newer checkpoint.
             self._wanted_checkpoint = self._wanted_checkpoint or pending
 
     async def _store_live_scene(self, event: Mapping[str, Any]) -> None:
@@ -267,4 +271,5 @@ class Reporter:
                 self.add_note(f"Warning: from here on no checkpoints are kept: {error}")
                 return
             self._checkpoint = checkpoint
+        # Not earlier: until the row names them, a later attempt could not fetch the frames.
         await asyncio.to_thread(self._workspace.stored_frames.remove_files)

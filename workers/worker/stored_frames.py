@@ -87,6 +87,7 @@ class StoredFrames:
         if len(fetched) == len(files):
             return files
         self.add(files)
+        # They are not fetched, so that damage would show only after the job is done.
         for file in self._files.values():
             check_content(storage.read(file.sha256), file.sha256)
         moved = {name.removeprefix(_FRAMES): file.sha256 for name, file in self._files.items()}

@@ -124,6 +124,7 @@ class Supervisor:
         except DATABASE_ERRORS as error:
             raise DatabaseLostError(str(error)) from error
         finally:
+            # After an error of this program too: no child may outlive its attempt.
             if self._child is not None:
                 self._child.kill()
             await cancel_and_wait(watches)
@@ -134,6 +135,7 @@ class Supervisor:
     async def _work(self) -> None:
         try:
             await asyncio.to_thread(self._workspace.open)
+            # The last attempt may have ended between publishing its results and writing its row.
             earlier = await asyncio.to_thread(self._workspace.find_published_results)
             if earlier is not None:
                 await self._outcomes.succeed(earlier)
@@ -143,7 +145,7 @@ class Supervisor:
         except OctasplatError as error:
             await self._outcomes.handle_error(error)
             return
-        if self._stop_reason is not None:
+        if self._stop_reason is not None:  # it was asked to stop while the folder was filled
             await self._after_stop(self._stop_reason)
             return
         try:
@@ -153,6 +155,7 @@ class Supervisor:
             await self._outcomes.diagnose_and_requeue(what)
             return
         code = await self._wait_for_child(self._child)
+        # Else the rows may be those of another attempt by now, and what is pending is dropped.
         if self._stop_reason not in (StopReason.FENCED, StopReason.DATABASE_LOST):
             await self._reporter.finish()
         # A program that was done before it heard of the wish to stop has succeeded.
@@ -163,6 +166,7 @@ class Supervisor:
         elif self._child.is_ready:
             await self._after_exit(self._child, code)
         else:
+            # The job's own code was not reached, so that this machine is suspected first.
             error_text = self._child.error["message"] if self._child.error is not None else f"code {code}"
             await self._outcomes.diagnose_and_requeue(
                 f"The job's program ended before it began: {error_text}"
@@ -180,6 +184,7 @@ class Supervisor:
             files = await files_of(connection, job.dataset_id) if job.dataset_id else []
             artifacts = await artifacts_of(connection, job.source_id) if job.source_id else []
             named = await files_of(connection, job.files_id) if job.files_id else []
+            # The limit is for all attempts of the job together.
             left = 3600 * settings.max_job_hours - await seconds_spent(connection, job)
         self._deadline_at = time.monotonic() + left
         checkpoint = None if job.checkpoint is None else Checkpoint.from_row(job.checkpoint)
@@ -203,6 +208,7 @@ class Supervisor:
             self._reporter.add_note,
             lambda: self._stop_reason is not None,
         )
+        # Last, as files that are written afterwards would belong to the worker's user.
         uids, workspace = settings.job_uids, self._workspace
         uid = await asyncio.to_thread(workspace.give_to_user, uids) if uids is not None else None
         return {
@@ -320,6 +326,7 @@ class Supervisor:
                 if self._stop_reason is not None and not is_asked_to_stop:
                     child.request_stop()
                     is_asked_to_stop = True
+                # Nothing is awaited between the checks above and this, so that no request is lost.
                 self._stop_event.clear()
                 news = asyncio.create_task(self._stop_event.wait())
                 timeout = left if math.isfinite(left) else None
@@ -392,6 +399,7 @@ class Supervisor:
         """Stop the child for ``reason``; the first reason counts, except for those that forbid writing."""
         if self._stop_reason is None or reason in (StopReason.FENCED, StopReason.DATABASE_LOST):
             self._stop_reason = reason
+        # A further reason may shorten the time that is left, never lengthen it.
         self._kill_at = min(self._kill_at, self._kill_deadline(reason))
         self._stop_event.set()
 
@@ -402,6 +410,7 @@ class Supervisor:
             return self._heartbeat.kill_at
         if reason is StopReason.CANCELED:
             return now + min(MAX_CANCEL_SECONDS, grace)
+        # Time for a checkpoint, for the two reasons after which the job may go on.
         return now + grace if reason in (StopReason.DRAINING, StopReason.TIME_LIMIT) else now
 
 

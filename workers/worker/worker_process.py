@@ -207,6 +207,7 @@ class _Worker:
             await self._sender.close()
         if self._is_database_lost:
             return EXIT_DATABASE_LOST
+        # Else others would count this worker as live for a while; nothing depends on it.
         with contextlib.suppress(*DATABASE_ERRORS):
             async with asyncio.timeout(5), self._pool.connection() as connection:
                 await remove_worker(connection, self._id)
@@ -274,6 +275,7 @@ class _Worker:
         if await self._held_back(queue) is not None:  # room may have been waited for
             await self._return_to_queue(job_id, entry_id)
             return
+        # Before the claim is sent: heartbeats are counted from here, see Heartbeat.
         since = time.monotonic()
         attempt = await claim(self._pool, job_id, entry_id, self._name)
         if attempt is None:

@@ -96,6 +96,7 @@ class Workspace:
 
     def close(self) -> None:
         """Remove the folder and release its locks."""
+        # Before the user is released, as the next job of that user could read what is left.
         remove_folder(self.folder)
         if self._user is not None:
             self._user.close()
@@ -135,6 +136,7 @@ class Workspace:
         self._dataset_lock = lock_dataset_folder(folder)
         place = folder / (re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_")[:60] or "scene")
         if not place.exists():
+            # Other attempts look for the final name, which only a complete folder gets.
             partial = folder / f".{uuid.uuid4().hex}.partial"
             try:
                 fetch_tree(self.storage, _tree_files(files), partial)
@@ -142,7 +144,7 @@ class Workspace:
                     partial.rename(place)
             finally:
                 shutil.rmtree(partial, ignore_errors=True)
-        os.utime(folder)
+        os.utime(folder)  # the sweep goes by this time
         self._dataset = place
         return place
 

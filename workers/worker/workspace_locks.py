@@ -35,6 +35,8 @@ def lock_dataset_folder(folder: Path) -> IO[bytes]:
             handle = (folder / LOCK_FILE).open("ab")
             fcntl.flock(handle, fcntl.LOCK_SH)
             with contextlib.suppress(FileNotFoundError):
+                # A sweep may have removed the file before its lock was taken, and a removed file protects
+                # nothing.
                 if os.path.samestat(os.fstat(handle.fileno()), (folder / LOCK_FILE).stat()):
                     return handle
             handle.close()
@@ -54,7 +56,7 @@ def sweep_workspaces(root: Path, dataset_seconds: float = 86_400.0) -> int:
     for folder in (root / "attempts").glob("*"):
         try:
             lock = open_locked(folder / LOCK_FILE, create=False)
-        except BlockingIOError:
+        except BlockingIOError:  # its worker is alive
             continue
         except OSError:
             if time.time() - folder.stat().st_mtime < 60:

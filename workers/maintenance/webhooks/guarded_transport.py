@@ -52,7 +52,7 @@ class GuardedTransport(httpx.AsyncBaseTransport):
         host = request.url.raw_host.decode("ascii")
         port = request.url.port or (443 if request.url.scheme == "https" else 80)
         addresses = await self._resolve_checked(host, port, str(request.extensions.get(OWNER_EXTENSION, "")))
-        for left, address in enumerate(addresses, start=1 - len(addresses)):
+        for left, address in enumerate(addresses, start=1 - len(addresses)):  # 0 is the last one
             numeric = httpx.Request(
                 request.method,
                 request.url.copy_with(host=str(address)),
@@ -86,6 +86,7 @@ class GuardedTransport(httpx.AsyncBaseTransport):
         """Resolve a host in a thread, which counts until it ends, even if nobody waits for it any more."""
         with self._lookups_lock:
             if self._lookups[owner] >= MAX_LOOKUPS_PER_OWNER:
+                # Taken for a failed lookup by the caller, so that the message is sent again later.
                 raise OSError("Too many hosts of one owner are being looked up.")
             self._lookups[owner] += 1
 

@@ -107,6 +107,7 @@ async def add_endpoint(
         TooManyEndpointsError: the owner has enough.
     """
     async with connection.transaction(), connection.cursor(row_factory=class_row(Endpoint)) as cursor:
+        # Else two requests at once would both find room for the last one.
         await lock_owner(connection, owner)
         count = await connection.execute(
             "SELECT count(*) AS n FROM webhook_endpoints WHERE owner = %s AND job_id IS NOT DISTINCT FROM %s",

@@ -77,6 +77,7 @@ class WebhookSender:
                 await record_outcome(connection, delivery, outcome)
             self.sent_count += 1
         except (psycopg.Error, PoolTimeout, OSError) as error:
+            # The lease runs out by itself, and the message is sent again.
             logger.info("what became of message %s was not entered: %s", delivery.id, error)
         except Exception:
             logger.exception("message %s was not sent and is tried again", delivery.id)
@@ -114,6 +115,7 @@ async def send(
     """Send a message once; only the status of the response is used."""
     body, headers = signed_message(endpoint.secret, delivery.id, delivery.payload, datetime.now(UTC))
     try:
+        # Checked here again, as the list of allowed hosts may have changed since the webhook was made.
         check_url(endpoint.url, allowed_hosts)
         async with (
             asyncio.timeout(TIMEOUT_SECONDS),

@@ -94,6 +94,7 @@ class ReconstructKind(OperationKind):
         train = options.train
         pixels = training_pixels(options, sizes)
         gaussians = max_gaussian_count(train, pixels)
+        # With a limit of time the count is not known before; the most that may be planned is demanded.
         iterations = MAX_PLANNED_ITERATIONS if options.minutes else iteration_count(train, pixels)
         return (
             ResourceDemand("train.iterations", "iterations", iterations),

@@ -20,8 +20,10 @@ def without_defaults(options: BaseModel) -> dict[str, Any]:
     """Return options as JSON values without those that are default."""
     complete = options.model_dump(mode="json")
     model = type(options)
+    # Not validated, as fields without a default are missing.
     defaults = model.model_construct().model_dump(mode="json", warnings=False)
     left = _differences(complete, defaults)
+    # Where a preset decides on other options, the rest alone may mean something else.
     try:
         is_same = model.model_validate(left).model_dump(mode="json") == complete
     except ValidationError:
@@ -36,6 +38,7 @@ def resolve_requested(kind: JobKind, values: Mapping[str, Any]) -> BaseModel:
         ValidationError: an option cannot be used.
         InvalidSettingsError: likewise.
     """
+    # By way of JSON values, as those of the row are read.
     resolved: BaseModel = kind.options.model_validate(kind.resolve(values).model_dump(mode="json"))
     return resolved
 

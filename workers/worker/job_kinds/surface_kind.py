@@ -88,6 +88,7 @@ class SurfaceKind(OperationKind):
         """Return the options of a job with changes; what its presets decided follows those of now."""
         presets = {name: options[name] for name in _PRESET_OPTIONS if name in options}
         decided = self.resolve(presets).model_dump(mode="json")
+        # What differs from the presets' choice was asked for, and stays.
         changed = {name: value for name, value in options.items() if decided.get(name) != value}
         return self.resolve({**presets, **changed, **changes})
 
