@@ -6,12 +6,19 @@ import numpy as np
 import pytest
 
 from octasplat.engine.core.color import linear_to_srgb
-from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
 from octasplat.engine.pathtracing.compile_meshes import compile_meshes
 from octasplat.engine.pathtracing.gaussian_layers import build_gaussian_layers
 from octasplat.engine.pathtracing.path_tracer import PathTracer, PathTracerScene
 from octasplat.engine.pathtracing.stage.materials import MetallicRoughness, Mirror
-from octasplat.engine.pathtracing.stage.model import Environment, Integrator, Stage, StageGaussians, StageMesh
+from octasplat.engine.pathtracing.stage.model import (
+    DirectionalLight,
+    Environment,
+    Integrator,
+    Stage,
+    StageGaussians,
+    StageMesh,
+)
 from octasplat.engine.render.environment_files import write_environment
 from octasplat.engine.trace.protocol import TraceSettings
 from tests.support.light_scenes import camera, psnr, shiny_ball
@@ -27,11 +34,17 @@ def sky(folder: Path, *, white: bool = False) -> str:
     return str(folder / "sky.exr")
 
 
-def picture(stage: Stage, gaussians: FlatGaussians | None, side: int = 24, threads: int = 2) -> np.ndarray:
+def picture(
+    stage: Stage,
+    gaussians: FlatGaussians | None,
+    side: int = 24,
+    threads: int = 2,
+    files: dict[str, FlatGaussians] | None = None,
+) -> np.ndarray:
     layers = build_gaussian_layers(
         stage,
         gaussians,
-        lambda path: pytest.fail(str(path)),
+        lambda path: (files or {})[path.name],
         FOLDER,
         TraceSettings(),
         size=1.0,
@@ -118,3 +131,33 @@ def test_material_render_independent_of_threads_and_colors(tmp_path):
     colored = shiny_ball(1500, 1.0, albedo=(0.5, 0.5, 0.5), metallic=0.5, roughness=0.3)
     colored.sh[:] = 1.0
     assert (picture(stage, colored, threads=2) == first).all()
+
+
+def test_new_lamps_light_what_is_seen_through_material_gaussians_as_what_is_beside_them():
+    """A lamp adds as much to a wall behind a veil with materials as without the veil, which reflects none."""
+    x, y = (2.0 * part.ravel() for part in np.mgrid[-1:1:41j, -1:1:41j])
+    quats = np.tile(np.float32([np.sqrt(0.5), 0, -np.sqrt(0.5), 0]), (len(x), 1))  # the normal along z
+    wall, veil = (
+        FlatGaussians(
+            np.stack([x, y, np.full(len(x), z)], axis=1).astype(np.float32),
+            quats,
+            np.full((len(x), 2), np.log(0.1), np.float32),
+            np.full(len(x), logit, np.float32),
+            np.full((len(x), 1, 3), -0.2 / SH_C0, np.float32),
+        )
+        for z, logit in ((0.5, 12.0), (-0.5, -1.5))
+    )
+    black = {"albedo": np.zeros((len(x), 3)), "metallic": np.zeros((len(x), 1))}
+    smooth = {"roughness": np.full((len(x), 1), 0.05)}
+    veil = veil.with_channels({k: v.astype(np.float32) for k, v in {**black, **smooth}.items()})
+    lamp = DirectionalLight(direction=(0, 1, 1), irradiance=3.0, adds_light=True)
+    through = StageGaussians(light="shadowed", ambient=1.0), StageGaussians(file="veil.ply", light="relit")
+
+    def shown(gaussians: tuple[StageGaussians, ...], *lights: DirectionalLight) -> np.ndarray:
+        settings = Integrator(samples=256, max_depth=1, anti_aliasing=False)
+        stage = Stage(gaussians=gaussians, lights=lights, integrator=settings)
+        return picture(stage, wall, side=8, files={"veil.ply": veil})[2:6, 2:6]
+
+    free, veiled = (shown(scenes, lamp) / shown(scenes) for scenes in (through[:1], through))
+    assert free.mean() > 1.2 and 0.2 < shown(through).mean() / shown(through[:1]).mean() < 0.8
+    np.testing.assert_allclose(veiled, free, rtol=0.01)

@@ -100,7 +100,8 @@ def intersect_gaussian_surfaces(
             transmittance[k] = min(left * rest, 1.0)
             for channel in range(3):
                 rgb[k, channel] *= rest
-                features[k, channel] *= rest
+            for feature in range(MATERIAL):
+                features[k, feature] *= rest
             depth_sum[k] *= rest
             continue
         # --- the path goes on from their surface ---
