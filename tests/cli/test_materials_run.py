@@ -10,6 +10,7 @@ import pytest
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
 from octasplat.engine.gaussians.materials import has_materials
 from octasplat.engine.render.environment_files import read_environment
+from tests.support.tiny_dataset import make_tiny_dataset
 
 MATERIALS = (
     "--materials", "--set", "materials.environment_height=16", "--set", "materials.ambient_occlusion_rays=4",
@@ -100,3 +101,32 @@ def test_render_says_where_materials_cannot_be_shown(materials_run, octasplat, t
 def test_render_of_plain_run_refuses_materials(run, octasplat, tmp_path):
     result = octasplat("render", run.output, "--shading", "materials", "-o", tmp_path / "views")
     assert result.exit_code == 1 and "has learnt no materials" in " ".join(result.output.split())
+
+
+def test_run_merged_with_scene_without_materials_shows_harmonics(materials_run, run, octasplat, tmp_path):
+    merged = tmp_path / "merged"
+    result = octasplat("merge", materials_run, run.output / "scene.ply", "-o", merged)
+    assert result.exit_code == 0, result.output
+    for name, more in (("by_default", ()), ("harmonics", ("--shading", "harmonics"))):
+        result = octasplat("render", merged, *more, "-o", tmp_path / name)
+        assert result.exit_code == 0, result.output
+        assert ("came from a scene without materials" in " ".join(result.output.split())) == (not more)
+    for path in (tmp_path / "harmonics").glob("*.png"):
+        assert (tmp_path / "by_default" / path.name).read_bytes() == path.read_bytes()
+    result = octasplat("evaluate", merged)
+    assert result.exit_code == 0, result.output
+    for path in (merged / "renders").glob("*.png"):
+        assert path.read_bytes() == (tmp_path / "harmonics" / path.name).read_bytes()
+
+
+def test_cameras_of_other_photographs_change_no_shading(materials_run, octasplat, tmp_path, tmp_path_factory):
+    """The extent by which reflections keep off surfaces is that of the training."""
+    few = make_tiny_dataset(tmp_path_factory, views=3)
+    pose = [[1, 0, 0, 0], [0, 1, 0, -0.5], [0, 0, 1, -2.5], [0, 0, 0, 1]]
+    frames = [{"camera_to_world": pose, "fov_y_degrees": 50}]
+    (tmp_path / "path.json").write_text(json.dumps({"width": 64, "height": 48, "frames": frames}))
+    cameras = ("--path", tmp_path / "path.json")
+    for name, more in (("own.exr", ()), ("other.exr", ("--dataset", few))):
+        result = octasplat("render", materials_run, *cameras, *more, "-o", tmp_path / name)
+        assert result.exit_code == 0, result.output
+    assert (tmp_path / "own.exr").read_bytes() == (tmp_path / "other.exr").read_bytes()
