@@ -64,6 +64,7 @@ class WorstAndBestViews(Mapping[str, ViewImages]):
         entry = (float("inf") if np.isnan(psnr) else psnr, name)
         place = bisect.bisect(self._order, entry)
         full = len(self._order) == self._worst + self._best
+        # Between the worst and the best ones, among which it is neither
         if full and place == self._worst:
             return
         self._order.insert(place, entry)

@@ -186,6 +186,7 @@ class GroundTruth:
         normal = albedo = None
         if maps.normal is not None:
             normal = _decode(self._stored_image("normal", name, size)[..., :3], maps.normal)
+            # Values of few bits make vectors of not quite unit length.
             normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
             normal[~mask] = 0.0
         if maps.albedo is not None:

@@ -137,6 +137,7 @@ class GroundTruthMeasures:
                 errors = np.abs(image.layers[channel][known.mask, 0] - true[known.mask])
                 self.rows[name][f"{channel}_mae"] = float(errors.mean(dtype=float))
         if known.albedo_linear is not None and ALBEDO in image.layers:
+            # Gathered, as the factors are fitted to all views together
             self._albedo.append(image.layers[ALBEDO][known.mask])
             self._true_albedo.append(known.albedo_linear[known.mask])
 

@@ -93,7 +93,7 @@ def fit_channel_scales(
 
     Least squares, between 1/256 and 256; 1 where a channel is black.
     """
-    step = -(-len(linear) // MOST_FITTED)
+    step = -(-len(linear) // MOST_FITTED)  # rounded up
     scales = np.ones(3)
     weight = 1.0 if weights is None else weights[::step].astype(np.float64)
     for channel in range(3):

@@ -206,6 +206,7 @@ def _ssim_terms(
 ) -> tuple[Float64[np.ndarray, "h w 3"], Float64[np.ndarray, "h w 3"]]:
     """Return the luminance term and the contrast-structure term of SSIM per pixel, with zero padding."""
     mean_x, mean_y = _gaussian_blur(x), _gaussian_blur(y)
+    # Variances as E(x^2) - E(x)^2 under the window
     variance_x = _gaussian_blur(x * x) - mean_x * mean_x
     variance_y = _gaussian_blur(y * y) - mean_y * mean_y
     covariance = _gaussian_blur(x * y) - mean_x * mean_y

@@ -127,6 +127,7 @@ def _template_values(
     mean = _as_mapping(metrics.get("mean"))
     views = {name: _as_mapping(row) for name, row in _as_mapping(metrics.get("views")).items()}
     columns = _metric_columns(mean)
+    # Views without a PSNR come last.
     worst_first = sorted(views, key=lambda name: (_as_number(views[name].get("psnr"), math.inf), name))
     embedded = embedded_names(worst_first, images)
     interval = metrics.get("mean_psnr_ci95")

@@ -301,6 +301,7 @@ def _evaluate_on(
     with phase("evaluate", progress, len(dataset.test_indices)):
         origin = read_metadata(output).origin_world
         run_views = read_views(output / VIEWS).about(origin) if (output / VIEWS).exists() else None
+        # A later evaluation tells by it whether the folder has measures of the same photographs.
         write_views(into / VIEWS, dataset.views_record)
         measure_run(
             dataset=dataset,

@@ -34,6 +34,7 @@ def select_channel_columns(
         if set(named) <= set(every) and is_valid_channel_name(name, named)
     }
     taken = {column for named in own.values() for column in named}
+    # Columns of declared channels are not grouped once more.
     rest = group_columns(column for column in every if column not in taken)
     known = {**own, **{name: named for name, named in rest.items() if is_valid_channel_name(name, named)}}
     if choice == "own":

@@ -37,7 +37,7 @@ def read(path: Path) -> GaussianCloud:
         name: np.ascontiguousarray(tables["vertex"][name]).astype(np.uint32) for name in _PACKED_PROPERTIES
     }
     chunk = np.arange(len(tables["vertex"])) // CHUNK_SIZE
-    rgba = packed["packed_color"]
+    rgba = packed["packed_color"]  # from the highest byte: red, green, blue, opacity
     color = np.stack([(rgba >> shift) & 255 for shift in (24, 16, 8)], axis=1).astype(np.float32) / 255
     if "min_r" in (tables["chunk"].dtype.names or ()):
         color = _dequantise(tables["chunk"], "{}_{}", "rgb", chunk, color)
@@ -102,6 +102,7 @@ def _dequantise(
 def _unpack_rotations(packed: UInt32[np.ndarray, " n"]) -> Float32[np.ndarray, "n 4"]:
     """Unpack quaternions: two bits for the index of the largest component, 10 bits for each other one."""
     fields = np.stack([(packed >> shift) & 1023 for shift in (20, 10, 0)], axis=1)
+    # A component that is not the largest is at most sqrt(1/2) in size.
     small = (fields / 1023.0 - 0.5) * (2.0 * SQRT_HALF)
     return from_smallest_three(small, (packed >> 30).astype(np.int64))
 
@@ -109,6 +110,7 @@ def _unpack_rotations(packed: UInt32[np.ndarray, " n"]) -> Float32[np.ndarray, "
 def _sh_rest(table: np.ndarray) -> Float32[np.ndarray, "n k 3"]:
     count = len(table.dtype.names or ())
     steps = columns(table, [f"f_rest_{k}" for k in range(count)])
+    # 0 and 255 stand for the bounds, every other step for the middle of its interval.
     share = np.where(steps == 0, 0.0, np.where(steps == 255, 1.0, (steps + 0.5) / 256.0))
     rest = ((share - 0.5) * SH_RANGE).astype(np.float32)
     return rest.reshape(len(table), 3, count // 3).transpose(0, 2, 1)

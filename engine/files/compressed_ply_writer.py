@@ -40,6 +40,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
             letter = "rgb"[axis] if key == "rgb" else f"{key}{'xyz'[axis]}"
             chunks[f"min_{letter}"], chunks[f"max_{letter}"] = low[:, axis], high[:, axis]
         place = np.arange(count) // CHUNK_SIZE
+        # Against the bounds as the file has them, in 32 bits, as they are decoded with these
         extent = (high.astype(np.float32) - low.astype(np.float32)).astype(np.float64)[place]
         offset = values - low.astype(np.float32).astype(np.float64)[place]
         shares[key] = np.divide(offset, extent, out=np.zeros_like(values), where=extent > 0)
@@ -55,6 +56,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     ]
     if scene.sh_degree > 0:
         rest = scene.sh[:, 1:].astype(np.float64).transpose(0, 2, 1).reshape(count, -1)
+        # Rounded down to the interval whose middle is decoded
         steps = np.clip(np.floor((rest / SH_RANGE + 0.5) * 256.0), 0, 255).astype(np.uint8)
         dtype = np.dtype([(f"f_rest_{k}", "u1") for k in range(steps.shape[1])])
         elements.append(PlyWriteElement("sh", count, dtype, [steps.view(dtype)[:, 0]]))

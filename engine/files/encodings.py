@@ -65,6 +65,7 @@ def smallest_three(
     """Return unit quaternions as the three smallest components and the place of the largest."""
     unit = unit_quats(quats)
     largest = np.argmax(np.abs(unit), axis=1)
+    # q and -q are one rotation; what is left out is taken to be positive.
     unit *= np.where(np.take_along_axis(unit, largest[:, None], axis=1) < 0, -1.0, 1.0)
     others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
     return np.take_along_axis(unit, others, axis=1), largest

@@ -112,6 +112,7 @@ def read_ply_metadata(path: Path) -> SceneMetadata:
     Raises:
         SceneFileError: the file is damaged, or says something that is no number.
     """
+    # Reversed, so that the first comment of a name counts
     metadata = dict(comment.partition(" ")[::2] for comment in reversed(read_ply_header(path).comments))
     known: dict[str, float] = {}
     for field in fields(SceneMetadata):
@@ -126,7 +127,7 @@ def read_ply_metadata(path: Path) -> SceneMetadata:
                 f"{path}: its comment {field.name} is {value!r}, which is no number."
             ) from None
     facts = SceneMetadata(**known, origin_world=_parse_origin(path, metadata.get(ORIGIN_KEY)))
-    return replace(facts, turned_beyond=min(facts.turned_beyond, 1.0))
+    return replace(facts, turned_beyond=min(facts.turned_beyond, 1.0))  # it is a cosine
 
 
 def metadata_comments(facts: SceneMetadata) -> list[str]:
@@ -158,7 +159,7 @@ def _row_blocks(gaussians: FlatGaussians, degree: int, dtype: np.dtype[np.void])
     for start in range(0, len(gaussians), ROWS_PER_BLOCK):
         part = slice(start, start + ROWS_PER_BLOCK)
         n = len(gaussians.means_world[part])
-        values = np.zeros((n, len(dtype.names or ())), dtype="<f4")
+        values = np.zeros((n, len(dtype.names or ())), dtype="<f4")  # normals stay 0
         values[:, 0:3] = gaussians.means_world[part]
         values[:, 6:9] = gaussians.sh[part, 0]
         rest = values[:, 9 : 9 + 3 * rest_file].reshape(n, 3, rest_file)
@@ -278,13 +279,17 @@ def _with_mip_filter(cloud: GaussianCloud, deviations: Float32[np.ndarray, " n"]
     """
     scales = cloud.log_scales.astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        # ln sqrt(s^2 + f^2) for the deviations s of the Gaussian and f of the filter
         wider = 0.5 * np.logaddexp(2.0 * scales, 2.0 * np.log(np.abs(deviations.astype(np.float64)))[:, None])
+        # ln of the ratio of the volumes, without axes that are infinitely thin
         lost = np.where(np.isfinite(scales), scales - wider, 0.0).sum(axis=1)
+        # ln(ratio) + ln(sigmoid)
         log_opacity = lost - np.logaddexp(0.0, -cloud.opacity_logits.astype(np.float64))
-        logits = log_opacity - np.log(-np.expm1(log_opacity))
+        logits = log_opacity - np.log(-np.expm1(log_opacity))  # ln a - ln(1 - a)
     return replace(
         cloud,
         log_scales=wider.astype(np.float32),
+        # Where the filter changes nothing, logits keep every bit.
         opacity_logits=np.where(lost == 0.0, cloud.opacity_logits, logits).astype(np.float32),
         notes=(*cloud.notes, f"Its smoothing filter ({_FILTER}) was folded into scales and opacities."),
     )
@@ -323,6 +328,7 @@ def _check_properties(path: Path, vertex: PlyElement) -> tuple[int, int]:
     scale_count = 3 if "scale_2" in names else 2
     needed = [*_POSITION, *_SH_DC, "opacity", *_scale_names(scale_count), *_ROTATION]
     missing = [name for name in needed if name not in names]
+    # Before the missing properties are told, as this says more
     refuse_anchors(path, names)
     if missing:
         raise SceneFileError(

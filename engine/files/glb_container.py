@@ -63,6 +63,7 @@ class GlbFile:
         """
         try:
             size = path.stat().st_size
+            # An empty file cannot be mapped.
             content = np.memmap(path, np.uint8, "r") if size else np.zeros(0, np.uint8)
         except OSError as error:
             raise SceneFileError(f"{path}: cannot be read ({error.strerror or error}).") from error
@@ -110,8 +111,10 @@ class GlbFile:
         stride = view.get("byteStride", kind.itemsize * width)
         if stride < kind.itemsize * width:  # rows that overlap could be more than the file has bytes
             raise ValueError(f"accessor {number} has rows that overlap")
+        # numpy refuses an array that reaches beyond the buffer.
         values: np.ndarray = np.ndarray((count, width), kind, self._binary, offset, (stride, kind.itemsize))
         if accessor.get("normalized") and kind.kind in "iu":
+            # As glTF has it: the least integer is -1, too.
             values = np.maximum(values.astype(np.float64) / np.iinfo(kind).max, -1.0)
         return values.astype(dtype)
 
@@ -150,6 +153,7 @@ class GlbFile:
         else:
             inner = {child for node in nodes for child in node.get("children", [])}
             roots = [number for number in range(len(nodes)) if number not in inner]
+        # A stack, hence reversed: nodes come in the order of the document.
         waiting = [(node, self._about_half_turn(node)) for node in reversed(roots)]
         reached: set[int] = set()
         found, count = [], 0
@@ -188,7 +192,7 @@ class GlbFile:
         """
         for matrix, primitive in self.primitives():
             x, y, z = matrix[:3, 3].tolist()
-            origin = (x, -y, -z)
+            origin = (x, -y, -z)  # from y up to y down
             bounds = self.document["accessors"][primitive["attributes"]["POSITION"]]
             reach = max(
                 (abs(value) for value in (*bounds.get("min", ()), *bounds.get("max", ()))), default=0.0
@@ -249,13 +253,14 @@ def root_translation(origin: Origin, rotation_xyzw: Sequence[float] = HALF_TURN_
 
 def _node_matrix(node: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:
     if "matrix" in node:
-        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T  # glTF stores columns
     matrix = np.eye(4)
     if "rotation" in node:
         x, y, z, w = node["rotation"]
         if not (x or y or z or w):
             raise ValueError("the rotation of a node has no length")
         matrix[:3, :3] = rotation_matrices(np.array([[w, x, y, z]], np.float64))[0]
+    # scales the columns: rotation times scale
     matrix[:3, :3] *= np.array(node.get("scale", (1, 1, 1)), np.float64)
     matrix[:3, 3] = node.get("translation", (0, 0, 0))
     return matrix
@@ -269,6 +274,7 @@ def light_rotation(light_frame: Float64[np.ndarray, "3 3"]) -> list[float]:
     Args:
         light_frame: right, up and forward of the light, as rows in the world.
     """
+    # Forward, up, right as rows: forward becomes x, and up becomes y.
     w, x, y, z = quaternions_from_matrices(light_frame[None, [2, 1, 0]])[0].tolist()
     return [x, y, z, w]
 
@@ -389,4 +395,4 @@ def write_glb(
         handle.seek(json_start)
         text = document()
         assert len(text) <= json_room
-        handle.write(text.ljust(json_room))
+        handle.write(text.ljust(json_room))  # filled up with spaces, as the format asks

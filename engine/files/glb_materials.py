@@ -38,10 +38,12 @@ def glb_materials(file: GlbFile, path: Path) -> tuple[MeshMaterial, ...]:
 
 def texture_frame(material: Mapping[str, Any]) -> tuple[int, Float64[np.ndarray, "2 3"]]:
     """Return the texture coordinate set of a material, and the matrix from it to image coordinates."""
+    # The first texture decides; others with other coordinates are told as unsupported.
     for info in _texture_infos(material).values():
         transform = info.get("extensions", {}).get("KHR_texture_transform", {})
         turn = float(transform.get("rotation", 0.0))
         (x, y), (u, v) = transform.get("scale", (1.0, 1.0)), transform.get("offset", (0.0, 0.0))
+        # uv' = offset + rotation . scale . uv
         matrix = np.array(
             [
                 [math.cos(turn) * x, math.sin(turn) * y, u],
@@ -105,8 +107,10 @@ class _MaterialReader:
         volume = self._extensions.get("volume", {})
         distance = float(volume.get("attenuationDistance", math.inf))
         left = [float(share) for share in volume.get("attenuationColor", (1.0, 1.0, 1.0))]
+        # A surface without thickness encloses no volume.
         if not (volume.get("thicknessFactor", 0.0) > 0.0 and 0.0 < distance < math.inf):
             return 0.0, 0.0, 0.0
+        # Beer-Lambert law: the color is what is left after the distance.
         red, green, blue = (-math.log(min(max(share, 1e-6), 1.0)) / distance for share in left)
         return red, green, blue
 
@@ -148,6 +152,7 @@ class _MaterialReader:
                 "GLB with its images inside."
             )
         content = self._file.view_bytes(image["bufferView"])
+        # By its first bytes, as the stated type may be wrong
         kind = next((suffix for start, suffix in KINDS.items() if content.startswith(start)), "")
         suffix = kind or SUFFIXES.get(image.get("mimeType", ""), ".png")
         name = f"{self._path} (image {image.get('name') or info['index']})"

@@ -68,13 +68,14 @@ def write_surface(
         shading["baseColorTexture"] = data.texture("surface", mesh.texture_srgb)
         if mesh.materials is not None:
             shading["metallicFactor"] = 1.0
+            # With factors of 1, the values of the texture count as they are.
             packed = data.texture("materials", mesh.materials.occlusion_roughness_metallic)
             shading["metallicRoughnessTexture"] = packed
             material["occlusionTexture"] = packed
             material["normalTexture"] = data.texture("normals", mesh.materials.normals)
         document |= {"textures": data.textures, "samplers": [SAMPLER], "images": data.images}
     elif mesh.rgb_srgb is not None:
-        attributes["COLOR_0"] = srgb_to_linear(mesh.rgb_srgb)
+        attributes["COLOR_0"] = srgb_to_linear(mesh.rgb_srgb)  # glTF has linear vertex colors
     used, accessors = _add_accessors(mesh, attributes, data)
     document |= {
         "meshes": [
@@ -121,6 +122,7 @@ class _SurfaceData:
         self.views.append({"buffer": 0, "byteOffset": self.length, "byteLength": len(piece)})
         if target is not None:
             self.views[-1]["target"] = target
+        # so that each view begins at a multiple of four bytes
         self.pieces.append(piece.ljust(pad_to_four(len(piece)), b"\0"))
         self.length += len(self.pieces[-1])
         return len(self.views) - 1
@@ -151,7 +153,7 @@ def _add_accessors(
                 view, glb_container.FLOAT, len(values), glb_container.vector_type(values.shape[1])
             )
         )
-    accessors[0] |= {
+    accessors[0] |= {  # glTF requires the bounds of positions
         "min": mesh.vertices_world.min(axis=0).tolist(),
         "max": mesh.vertices_world.max(axis=0).tolist(),
     }

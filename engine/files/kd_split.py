@@ -47,7 +47,8 @@ def kd_order(points_world: Float[np.ndarray, "n 3"], chunk: int) -> Int[np.ndarr
         along = points_world[part, axis].astype(np.float64)
         splits = np.arange(chunk, len(part), chunk)
         costs = splits * (along[splits - 1] - along[0]) + (len(part) - splits) * (along[-1] - along[splits])
+        # Of equally good splits, the one nearest to the middle
         middle = np.abs(2 * splits - len(part))
         best = splits[np.lexsort((middle, costs))[0]]
-        waiting += [part[best:], part[:best]]
+        waiting += [part[best:], part[:best]]  # a stack: the first half is taken next
     return np.concatenate([*done, np.zeros(0, dtype=np.int64)])

@@ -104,6 +104,7 @@ def _read_cloud(file: GlbFile, attributes: dict[str, int], splats: dict[str, Any
     if splats.get("colorSpace") == "lin_rec709_display":
         notes = ("Its colors are linear; they were converted, without what depends on the view.",)
         sh = sh0_from_rgb(linear_to_srgb(0.5 + SH_C0 * sh[:, 0]))
+    # Opacities of 0 and 1 have infinite logits, which flatten() replaces.
     with np.errstate(divide="ignore", invalid="ignore"):
         opacity = file.array(attributes[f"{EXTENSION}:OPACITY"], np.float32)[:, 0].astype(np.float64)
         logits = np.log(opacity) - np.log1p(-opacity)
@@ -153,6 +154,7 @@ def _apply_node_transform(
 ) -> GaussianCloud:
     linear = matrix[:3, :3]
     scale = float(np.cbrt(np.linalg.det(linear)))
+    # A map that mirrors has a negative determinant.
     if not scale > 0 or np.abs(linear @ linear.T / scale**2 - np.eye(3)).max() > SIMILARITY_TOLERANCE:
         raise SceneFileError(f"{path}: a node mirrors its splats or scales them unevenly; apply it first.")
     rotation = linear / scale

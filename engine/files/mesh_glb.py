@@ -119,6 +119,7 @@ def _read_triangles(file: GlbFile, *, with_materials: bool) -> tuple[ImportedMes
             indices = file.array(primitive["indices"], np.int64).reshape(-1, 3)
         else:
             indices = np.arange(size - size % 3).reshape(-1, 3)
+        # A node that mirrors turns the winding of its triangles over.
         mirrored = with_materials and np.linalg.det(matrix[:3, :3]) < 0
         triangles.append((indices[:, ::-1] if mirrored else indices) + count)
         number = int(primitive.get("material", -1))
@@ -131,7 +132,7 @@ def _read_triangles(file: GlbFile, *, with_materials: bool) -> tuple[ImportedMes
             if name in attributes:
                 values = file.array(attributes[name], np.float32)
                 if key == "normal":
-                    values = values @ np.linalg.inv(matrix[:3, :3])
+                    values = values @ np.linalg.inv(matrix[:3, :3])  # n' = M^-T n, in rows
                 elif key == "uv" and with_materials:
                     values = values @ turn[:, :2].T + turn[:, 2]
                 extras[key].append(values[:, : ATTRIBUTE_WIDTHS.get(key, 1)].astype(np.float32))

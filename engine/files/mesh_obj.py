@@ -72,13 +72,13 @@ def _read(path: Path, parts: ObjParts) -> ImportedMesh:
     if not parts.positions:
         raise SceneFileError(f"{path}: is no OBJ mesh; it has no line that begins with 'v'.")
     positions = np.concatenate(parts.positions)
-    parts.positions.clear()
+    parts.positions.clear()  # or they are in memory twice
     uv = uv_of_vertices(path, parts, len(positions))
     materials = _read_materials(path, parts, len(positions)) if parts.with_materials else {}
     parts.uv.clear()
     parts.triangle_uv.clear()
     triangles = np.concatenate([*parts.triangles, np.zeros((0, 3), np.int32)], dtype=np.int64)
-    rounding = 0.5 * 10.0**-parts.decimals
+    rounding = 0.5 * 10.0**-parts.decimals  # half a unit of the last digit
     return ImportedMesh(
         positions,
         triangles,
@@ -98,12 +98,14 @@ def _read_materials(path: Path, parts: ObjParts, count: int) -> dict[str, Any]:
     if parts.uv and (places >= 0).any():
         table = np.concatenate([flip_v(np.concatenate(parts.uv)), np.full((1, 2), np.nan, np.float32)])
         looks["corner_uv"] = table[places]  # -1 is the last row
+    # Only where every vertex has a color, as they are told apart by their order
     if sum(map(len, parts.colors)) == count:
         looks["rgb_linear"] = srgb_to_linear(np.clip(np.concatenate(parts.colors), 0, 1)).astype(np.float32)
     if parts.material_uses:
         known = {name: k for k, name in enumerate(dict.fromkeys(name for _, name in parts.material_uses))}
         materials = read_mtl(path, parts.libraries)
         numbers = np.full(len(places), -1, np.int32)
+        # Each use holds until the next one.
         for start, name in parts.material_uses:
             numbers[start:] = known[name]
         missing = MeshMaterial("", unsupported=("no entry in an MTL file",))
@@ -121,6 +123,7 @@ def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions)
     """
     soup = OctagonSoup(gaussians, path, options)
     material, texture = _octagon_files(path)
+    # What the OBJ names is written before it.
     with atomic_replace(texture) as temporary:
         temporary.write_bytes(grey_png(options.falloff_texture_size, options.q))
     write_text(material, f"{_material_entry(MATERIAL)}map_d {texture.name}\n")
@@ -149,6 +152,7 @@ def _octagon_lines(soup: OctagonSoup, material_name: str, origin: Origin) -> Ite
         yield _vertex_lines(batch)
     for start in range(0, len(soup), BATCH_SIZE):
         count = min(BATCH_SIZE, len(soup) - start)
+        # Numbers begin at 1; positions and texture coordinates have the same ones.
         indices = octagon_triangles(count) + (1 + start * SIDES)
         yield FACE_LINE * len(indices) % tuple(np.repeat(indices.reshape(-1), 2).tolist())
 

@@ -103,7 +103,7 @@ def read_with_materials(path: Path) -> ImportedMesh:
     table = read_ply(path, ["vertex"])[1]["vertex"]
     names = set(table.dtype.names or ())
     uv = mesh.uv
-    if uv is None and {"u", "v"} <= names:
+    if uv is None and {"u", "v"} <= names:  # other programs' names of s and t
         uv = columns(table, ("u", "v"))
     colors = None
     if set(COLORS) <= names:

@@ -32,6 +32,7 @@ def read_mtl(obj: Path, names: Sequence[str]) -> dict[str, MeshMaterial]:
     folder = obj.parent.resolve()
     for name in names:
         path = (folder / name.replace("\\", "/")).resolve()
+        # Nothing outside the folder of the OBJ is read, whatever it names.
         if not (path.is_relative_to(folder) and path.is_file()):
             continue
         try:
@@ -68,9 +69,10 @@ def _parse_material(path: Path, entry: dict[str, str]) -> MeshMaterial:
             found[field] = resolve_image(path, _file_name(entry[key]))
     if "texture" in found:
         colors["Kd"] = (1.0, 1.0, 1.0)  # programs leave a grey here that the image is not meant to have
+    # Images are multiplied by the color, which may be missing or black beside them.
     if "emission_texture" in found and not any(colors.get("Ke", ())):
         colors["Ke"] = (1.0, 1.0, 1.0)
-    opacity = numbers.get("d", 1.0 - numbers.get("Tr", 0.0))
+    opacity = numbers.get("d", 1.0 - numbers.get("Tr", 0.0))  # Tr is transparency
     clear = int(numbers.get("illum", 0)) in GLASS_ILLUM_MODELS and ("Ni" in numbers or opacity < 1.0)
     known = NUMBERS | COLORS | set(IMAGES) | IGNORED_KEYS
     passed_over = [key for key in entry if key not in known]
@@ -92,7 +94,7 @@ def _parse_material(path: Path, entry: dict[str, str]) -> MeshMaterial:
 def _parse_numbers(path: Path, key: str, text: str, count: int) -> tuple[float, ...]:
     words = text.split()
     if count == 3 and len(words) == 1:
-        words *= 3
+        words *= 3  # one number is gray
     try:
         values = tuple(float(word) for word in words[:count])
     except ValueError:

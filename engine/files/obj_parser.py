@@ -62,6 +62,7 @@ def parse_block(path: Path, block: bytes, parts: ObjParts) -> None:
         for line in block.split(b"\n", MAX_HEADER_LINES)[:MAX_HEADER_LINES]:
             if line.startswith(b"#"):
                 parts.comments.append(line[1:].decode("utf-8", "replace").strip())
+    # A backslash at the end of a line continues it.
     if b"\\\n" in block or b"\\\r\n" in block:
         block = block.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
     if _INDENT.search(block):
@@ -82,6 +83,7 @@ def parse_block(path: Path, block: bytes, parts: ObjParts) -> None:
     )
     if is_position.any():
         text = _select_lines(data, is_position, lengths)
+        # Numbers contain none of the letters that are taken out.
         values = _parse_number_rows(path, text.translate(None, b"v"), int(is_position.sum()), "v")
         if values.shape[1] < 3:
             raise SceneFileError(f"{path}: a line 'v' has fewer than three numbers.")
@@ -89,6 +91,7 @@ def parse_block(path: Path, block: bytes, parts: ObjParts) -> None:
         if parts.with_materials and values.shape[1] >= 6:
             parts.colors.append(values[:, 3:6].astype(np.float32))
         parts.vertex_count += len(values)
+        # The first lines tell how many decimals the file keeps.
         for line in text.split(b"\n", DIGIT_LINES)[:DIGIT_LINES]:
             words = line.split()[1:4]
             parts.decimals = max([parts.decimals, *(len(word.partition(b".")[2]) for word in words)])
@@ -195,7 +198,7 @@ def _is_ragged(text: bytes, words_per_line: int) -> bool:
     data = np.frombuffer(text, np.uint8)
     gap = data <= SPACE
     starts = ~gap
-    starts[1:] &= gap[:-1]
+    starts[1:] &= gap[:-1]  # first bytes of words
     ends = np.flatnonzero(data == NEWLINE)
     counts = np.diff(np.concatenate([[0], np.cumsum(starts, dtype=np.int64)[ends]]))
     return bool((counts != words_per_line).any())

@@ -87,6 +87,7 @@ class OctagonSoup:
         self._opacities = gaussians.opacities
         self._radii = octagon_radii(self._opacities, options.q)
         if alpha_cutoff is not None:
+            # The octagon surrounds the ellipse: its sides touch it, not its corners.
             around = octagon_radii(self._opacities, -2.0 * math.log(alpha_cutoff)) / np.float32(APOTHEM)
             self._radii = np.minimum(self._radii, around)
         self.ids = np.flatnonzero((self._radii > 0.0) & (self._opacities >= options.min_opacity))

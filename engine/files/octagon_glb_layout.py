@@ -31,6 +31,7 @@ from octasplat.engine.shading.environment_frame import environment_frame
 OPAQUE_CUTOFF = 0.2
 """``opaque``: a pixel is drawn where opacity times fall-off reaches this; best of 0.03 to 0.6 on a
 trained scene (docs/opening/threejs.md)."""
+# Takes as many characters in JSON as a float32 can.
 WIDEST_NUMBER = float(np.float32(-1.1754943508222875e-38))
 
 Bounds = tuple[list[float], list[float]]
@@ -126,6 +127,7 @@ class GlbLayout:
             accessors[used["POSITION"]] |= {"min": bounds[chunk][0], "max": bounds[chunk][1]}
             if self._options.ids:
                 used[CORNER.semantic] = len(accessors)
+                # All chunks share view 2, the corner numbers, and view 1, the indices.
                 accessors.append(accessor_json(2, FLOAT, size * SIDES, CORNER.type))
             accessors.append(accessor_json(1, UNSIGNED_INT, size * len(FAN_TRIANGLES) * 3, "SCALAR"))
             blended = {"attributes": used, "indices": len(accessors) - 1, "material": 0}

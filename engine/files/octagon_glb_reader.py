@@ -63,6 +63,7 @@ def _read_primitive(
 ) -> tuple[GaussianCloud, Float32[np.ndarray, " n"]]:
     """Return the Gaussians of a primitive, and their numbers in the scene."""
     attributes = primitive["attributes"]
+    # From glTF's y up to our y down
     turned = np.diag([1.0, -1.0, -1.0, 1.0]) @ file.about_origin(matrix)
     vertices = file.array(attributes["POSITION"], np.float64) @ turned[:3, :3].T + turned[:3, 3]
     offset = 2.0 * file.array(attributes["TEXCOORD_0"], np.float64) - 1.0
@@ -70,11 +71,12 @@ def _read_primitive(
         raise edited_octagons_error(path)
     corners = vertices.astype(np.float32).reshape(-1, SIDES, 3)
     offset = offset.reshape(-1, SIDES, 2)
-    share = np.linalg.norm(offset, axis=2).mean(axis=1)
+    share = np.linalg.norm(offset, axis=2).mean(axis=1)  # radius / sqrt(Q)
     if np.abs(offset - share[:, None, None] * corner_directions()).max(initial=0.0) > TOLERANCE:
         raise edited_octagons_error(path)
     radii = (share * np.sqrt(q)).astype(np.float32)
     means, quats, log_scales = gaussians_from_octagons(corners, radii, path)
+    # All corners of an octagon have the same values.
     rgba = file.array(attributes["COLOR_0"], np.float32)[::SIDES]
     with np.errstate(divide="ignore"):
         logits = np.log(rgba[:, 3].astype(np.float64)) - np.log1p(-rgba[:, 3].astype(np.float64))
@@ -86,6 +88,7 @@ def _read_primitive(
         name: np.concatenate([file.array(columns[column], np.float32)[::SIDES] for column in own], axis=1)
         for name, own in requested.items()
     }
+    # Without numbers, the order of the file is taken.
     ids = np.arange(len(corners), dtype=np.float32)
     if "_GID" in attributes:
         ids = file.array(attributes["_GID"], np.float32)[::SIDES, 0]

@@ -58,7 +58,7 @@ def missing_gaussians_notes(stated: int, found: int) -> tuple[str, ...]:
 
 def is_octagon_ply(head: bytes) -> bool:
     """Return whether a file with this head is a PLY of octagons that carries the ids of their Gaussians."""
-    properties = head.partition(b"end_header")[0].replace(b"\r", b"")
+    properties = head.partition(b"end_header")[0].replace(b"\r", b"")  # some programs end lines with CR LF
     return head.startswith(b"ply") and all(
         f" {name}\n".encode() in properties for name in ("gid", "corner", "radius")
     )

@@ -81,12 +81,14 @@ def read(path: Path) -> GaussianCloud:
             return _decode(
                 path, _bundle_member(path, bundle, META_FILE), _bundle_images(path, bundle, Path(folder))
             )
+    # RuntimeError: a member is encrypted; NotImplementedError: a compression that zipfile lacks
     except (OSError, zipfile.BadZipFile, RuntimeError, NotImplementedError) as error:
         raise SceneFileError(f"{path}: is damaged or cannot be read ({error}).") from error
 
 
 def _folder_images(path: Path) -> Images:
     def load(name: str) -> UInt8[np.ndarray, "h w 4"]:
+        # The name alone, so that nothing outside the folder is read
         return _rgba_pixels(path, name, path.parent / Path(name).name)
 
     return load
@@ -117,6 +119,7 @@ def _rgba_pixels(path: Path, name: str, image: Path) -> UInt8[np.ndarray, "h w 4
 
     if not image.exists():
         raise SceneFileError(f"{path}: its image {name} is missing.")
+    # Alpha holds data, which must not be multiplied into the colors.
     as_stored = oiio.ImageSpec()
     as_stored["oiio:UnassociatedAlpha"] = 1
     source = oiio.ImageInput.open(str(image), as_stored)
@@ -158,6 +161,7 @@ def _decode(path: Path, text: bytes, images: Images) -> GaussianCloud:
         return pixels[:count]
 
     low, high = rgba(meta.means)[:, :3], rgba(meta.means, 1)[:, :3]
+    # One image has the low bytes, the other the high ones.
     curved = _dequantise(path, meta.means, (low.astype(np.float64) + 256.0 * high) / 65535.0)
     color = rgba(meta.sh0)
     if meta.version == 2:
@@ -172,6 +176,7 @@ def _decode(path: Path, text: bytes, images: Images) -> GaussianCloud:
     if meta.shN is not None:
         sh = np.concatenate([sh, _sh_rest(path, meta.shN, images, rgba(meta.shN, 1))], axis=1)
     return GaussianCloud(
+        # inverse of sign(x) ln(1 + |x|)
         means_world=(np.sign(curved) * np.expm1(np.abs(curved))).astype(np.float32),
         quats_wxyz=_decode_rotations(rgba(meta.quats)),
         log_scales=scales,
@@ -235,6 +240,7 @@ def _sh_rest(
             raise SceneFileError(f"{path}: its {META_FILE} should give one bound for {part.files[0]}.")
         palette = (low + (high - low) * (pixels[:, :, :3] / 255.0)).astype(np.float32)
     palette = palette.reshape(rows * PALETTE_COLUMNS, k, 3)
+    # low byte in red, high byte in green
     entry = labels[:, 0].astype(np.int64) + 256 * labels[:, 1].astype(np.int64)
     if len(entry) and int(entry.max()) >= len(palette):
         raise SceneFileError(
@@ -268,6 +274,7 @@ def _find_losses(scene: FlatGaussians) -> tuple[str, ...]:
     means = scene.means_world.astype(np.float64)
     curved = np.sign(means) * np.log1p(np.abs(means))
     step = np.ptp(curved, axis=0) / 65535.0
+    # dx = (1 + |x|) d(ln(1 + |x|))
     return find_position_losses("sog", scene, ((1.0 + np.abs(means)) * step).max(axis=1))
 
 

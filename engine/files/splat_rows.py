@@ -10,6 +10,7 @@ from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.gaussians.model import FlatGaussians
 
 ROWS_PER_BLOCK = 65536
+# A little less than the largest, whose power may be rounded to infinity
 MAX_LOG_SCALE = float(np.log(np.finfo(np.float32).max)) - 1e-3
 
 

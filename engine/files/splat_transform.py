@@ -47,6 +47,7 @@ def convert(source: Path, target: Path, *options: str) -> None:
     program = find_converter()
     if program is None:
         raise SceneFileError(f"{target}: {missing_converter()}.")
+    # Quiet, overwriting, without a GPU
     command = [str(program), "-q", "-w", "-g", "cpu", *options, str(source.resolve()), str(target.resolve())]
     try:
         done = subprocess.run(  # noqa: S603 - no shell, and the paths are absolute

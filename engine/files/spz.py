@@ -148,19 +148,19 @@ def _pack_block(scene: FlatGaussians, bits: int) -> tuple[bytes, ...]:
 def _fitting_bits(scene: FlatGaussians) -> int:
     """Return how many fractional bits the farthest position leaves; negative where it has no room."""
     largest = float(np.abs(scene.means_world).max())
-    return int(np.floor(np.log2((2**23 - 1) / max(largest, 1.0 / 256.0))))
+    return int(np.floor(np.log2((2**23 - 1) / max(largest, 1.0 / 256.0))))  # 2^bits |x| <= 2^23 - 1
 
 
 def _fractional_bits(scene: FlatGaussians) -> int:
     small = float(np.quantile(scene.log_scales.min(axis=1).astype(np.float64), SMALL_QUANTILE))
-    needed = int(np.ceil(np.log2(STEPS_PER_SIGMA) - small / np.log(2.0)))
+    needed = int(np.ceil(np.log2(STEPS_PER_SIGMA) - small / np.log(2.0)))  # 2^bits sigma >= STEPS_PER_SIGMA
     return min(max(needed, FRACTIONAL_BITS), _fitting_bits(scene), 23)
 
 
 def _find_losses(scene: FlatGaussians) -> tuple[str, ...]:
     if len(scene) == 0 or not scene.is_finite() or _fitting_bits(scene) < 0:
         return ()  # which is refused
-    half = 0.5 / LOG_SCALE_STEPS
+    half = 0.5 / LOG_SCALE_STEPS  # what is this far out of range is still rounded to its end
     largest = 255.0 / LOG_SCALE_STEPS - LOG_SCALE_OFFSET
     return (
         *find_size_losses("spz", scene, -LOG_SCALE_OFFSET - half, largest + half),
@@ -171,7 +171,7 @@ def _find_losses(scene: FlatGaussians) -> tuple[str, ...]:
 
 def _pack_positions(steps: Float[np.ndarray, "n 3"]) -> bytes:
     integers = np.ascontiguousarray(np.rint(steps).astype("<i4"))
-    return integers.view(np.uint8).reshape(*steps.shape, 4)[:, :, :3].tobytes()
+    return integers.view(np.uint8).reshape(*steps.shape, 4)[:, :, :3].tobytes()  # the three low bytes
 
 
 def _pack_rotations(scene: FlatGaussians) -> bytes:

@@ -143,6 +143,7 @@ def write_spz(path: Path, file: SpzFile) -> None:
             _write_v4(handle, file)
             return
         header = (file.version, file.count, file.sh_degree, file.fractional_bits, file.flags, 0)
+        # Without the time, equal scenes give equal files.
         with gzip.GzipFile("", "wb", GZIP_LEVEL, handle, mtime=0) as packed:
             packed.write(_HEADER.pack(MAGIC, *header))
             for stream in file.streams:

@@ -45,6 +45,7 @@ def material_ramp_uv(
 ) -> Float32[np.ndarray, "n 2"]:
     """Return the texture coordinates at which the ramp has these values, interpolated between its pixels."""
     both = np.clip(np.concatenate([metallic, roughness], axis=1), 0.0, 1.0)
+    # 0 and 1 are the centers of the first and the last pixel.
     return ((both * (RAMP_SIZE_PX - 1) + 0.5) / RAMP_SIZE_PX).astype(np.float32)
 
 

@@ -101,7 +101,7 @@ def _write_stage(pxr: dict[str, ModuleType], scene: FlatGaussians, layer: Path, 
     root = geom.Xform.Define(stage, ROOT)
     if is_set(origin):
         x, y, z = origin
-        root.AddTranslateOp(geom.XformOp.PrecisionDouble).Set((x, -y, -z))
+        root.AddTranslateOp(geom.XformOp.PrecisionDouble).Set((x, -y, -z))  # turned to y up, as the data are
     stage.SetDefaultPrim(root.GetPrim())
     prim = vol.ParticleField.Define(stage, FIELD).GetPrim()
     for schema in SCHEMAS:
@@ -125,6 +125,7 @@ def _write_stage(pxr: dict[str, ModuleType], scene: FlatGaussians, layer: Path, 
     reach = EXTENT_SIGMAS * scene.scales.max(axis=1, keepdims=True)
     extent = np.stack([(scene.means_world - reach).min(axis=0), (scene.means_world + reach).max(axis=0)])
     attribute("extent", vt.Vec3fArray.FromNumpy(extent.astype(np.float32)))
+    # For programs that know no particle fields, and show colored points
     fallback = geom.Gprim(prim)
     colors = srgb_to_linear(np.clip(scene.base_rgb_srgb, 0.0, 1.0))
     fallback.CreateDisplayColorPrimvar(geom.Tokens.vertex).Set(vt.Vec3fArray.FromNumpy(colors))

@@ -33,6 +33,7 @@ def transform_gaussians(gaussians: FlatGaussians, matrix: Float[np.ndarray, "4 4
     u, stretches, vt = np.linalg.svd(linear)
     if stretches[2] <= 1e-9 * stretches[0]:
         raise ConfigError("The matrix flattens space; each direction needs a scale other than 0.")
+    # Orthogonal factor of the polar decomposition; a reflection where M mirrors
     turn = u @ vt
     count = len(gaussians)
     means = gaussians.means_world.astype(np.float64) @ linear.T + shift
@@ -96,6 +97,7 @@ def rotation(axis_world: Float[np.ndarray, "3"], degrees: float) -> Float64[np.n
         cos, sin = -sin, cos
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     matrix = np.eye(4)
+    # Rodrigues' formula
     matrix[:3, :3] += sin * cross + (1 - cos) * (cross @ cross)
     return matrix
 

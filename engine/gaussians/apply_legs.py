@@ -68,6 +68,7 @@ def apply_legs_to(
     for block in row_blocks(len(rows)):
         chosen = rows[block]
         gaussians.means_world[chosen] = means_world[chosen].astype(np.float32)
+        # Centers move in any case; a frame needs legs with an area.
         chosen = chosen[has_area(legs[chosen], np.zeros(len(chosen)))]
         part, new_legs, signs = gaussians.select(chosen), legs[chosen], normal_signs[chosen]
         quats, log_scales = frames_from_skewed_legs(new_legs, signs)

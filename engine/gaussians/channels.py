@@ -178,6 +178,7 @@ def check_channel_names(widths: Mapping[str, int]) -> None:
         if not is_valid_channel_name(name, own):
             raise ConfigError(f"'{name}' cannot name a channel, as files use this name for something else.")
     every = [column for own in columns.values() for column in own]
+    # A file must give back the channels as they are here.
     if len({column.lower() for column in every}) < len(every) or group_columns(every) != columns:
         raise ConfigError(
             f"The channels {', '.join(widths)} cannot be told apart in a file; choose names that do not end "

@@ -189,6 +189,7 @@ def _flatten_smallest_axis(
     """
     own = np.abs(log_scales[:, 0] - flat_log_scale) <= LOG_SCALE_TOLERANCE
     axis = np.where(own, 0, np.argmin(log_scales, axis=1))
+    # In cyclic order, so that frames stay right-handed
     order = (axis[:, None] + np.arange(3)) % 3
     ordered = np.take_along_axis(log_scales, order, axis=1)
     in_plane = np.ascontiguousarray(ordered[:, 1:])
@@ -206,6 +207,7 @@ def rotate_axis_to_first(
     """
     w, x, y, z = quats_wxyz.T
     a, b, c, d = _CYCLIC_ROTATIONS[axis].T
+    # Hamilton product
     product = np.stack(
         [
             w * a - x * b - y * c - z * d,

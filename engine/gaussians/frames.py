@@ -36,11 +36,13 @@ def quaternions_from_matrices(rotations: Float[np.ndarray, "n 3 3"]) -> Float[np
     """
     r = rotations.astype(np.float64)
     m00, m11, m22 = r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]
+    # 4 w^2 - 1, 4 x^2 - 1, 4 y^2 - 1 and 4 z^2 - 1
     squares = np.stack([m00 + m11 + m22, m00 - m11 - m22, m11 - m00 - m22, m22 - m00 - m11], axis=-1)
     largest = np.argmax(squares, axis=-1)
     a, b, c = r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]
     d, e, f = r[:, 1, 0] + r[:, 0, 1], r[:, 0, 2] + r[:, 2, 0], r[:, 2, 1] + r[:, 1, 2]
     s = 1 + squares
+    # Row k is the quaternion times 4 times its component k.
     candidates = np.stack(
         [
             np.stack([s[:, 0], a, b, c], axis=-1),
@@ -59,6 +61,7 @@ def quaternions_from_matrices(rotations: Float[np.ndarray, "n 3 3"]) -> Float[np
 def frames_from_normals(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
     """Return right-handed frames whose first column is the unit normal; in-plane axes are arbitrary."""
     n = normals.astype(np.float64)
+    # The axis nearest to the plane, for a long cross product
     helper = np.eye(3)[np.argmin(np.abs(n), axis=-1)]
     r2 = np.cross(helper, n)
     r2 /= np.linalg.norm(r2, axis=-1, keepdims=True)

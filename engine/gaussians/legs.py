@@ -35,7 +35,7 @@ def frames_from_skewed_legs(
     """
     a, b = legs[:, :, 0], legs[:, :, 1]
     aa, bb, ab = np.sum(a * a, axis=-1), np.sum(b * b, axis=-1), np.sum(a * b, axis=-1)
-    angles = 0.5 * np.arctan2(2 * ab, aa - bb)
+    angles = 0.5 * np.arctan2(2 * ab, aa - bb)  # tan(2 angle) = 2 a.b / (a.a - b.b)
     # atan2 makes the first axis the longer one; a quarter turn back keeps the axes in their order.
     angles -= np.where(angles > np.pi / 4, np.pi / 2, 0) - np.where(angles < -np.pi / 4, np.pi / 2, 0)
     cos, sin = np.cos(angles)[:, None], np.sin(angles)[:, None]
@@ -94,6 +94,7 @@ def volume_derivatives(
     tangents = surface_derivatives(gaussians, new_legs)
     product = np.cross(tangents[:, :, 0], tangents[:, :, 1])
     area = np.linalg.norm(product, axis=-1, keepdims=True)
+    # Of length sqrt(area), the mean stretch of the surface
     normals = product / np.sqrt(np.maximum(area, np.finfo(np.float64).tiny)) * normal_signs[:, None]
     result: np.ndarray = np.concatenate([normals[:, :, None], tangents], axis=2) @ old.transpose(0, 2, 1)
     return result
@@ -112,12 +113,15 @@ def has_area(legs: Float[np.ndarray, "n 3 2"], rounding: Float[np.ndarray, " n"]
 
 def _polar_factors(tangents: Float64[np.ndarray, "n 3 2"]) -> Float64[np.ndarray, "n 3 2"]:
     """Return the nearest matrices with orthonormal columns, F (F^T F)^(-1/2), in closed form."""
+    # Scaled to about 1, so that squares neither overflow nor vanish
     scale = np.maximum(np.abs(tangents).max(axis=(1, 2), keepdims=True), np.finfo(np.float64).tiny)
     f = tangents / scale
     gram = f.transpose(0, 2, 1) @ f
     root_det = np.linalg.norm(np.cross(f[:, :, 0], f[:, :, 1]), axis=-1)
     trace = gram[:, 0, 0] + gram[:, 1, 1]
+    # Square root of the 2 x 2 matrix G: (G + sqrt(det G) I) / sqrt(tr G + 2 sqrt(det G))
     root = (gram + root_det[:, None, None] * np.eye(2)) / np.sqrt(trace + 2 * root_det)[:, None, None]
+    # The determinant of the root is root_det.
     inverse = (
         np.stack(
             [
@@ -129,6 +133,7 @@ def _polar_factors(tangents: Float64[np.ndarray, "n 3 2"]) -> Float64[np.ndarray
         / np.maximum(root_det, np.finfo(np.float64).tiny)[:, None, None]
     )
     q = f @ inverse
+    # Gram-Schmidt, against what rounding left of scale and shear
     first = q[:, :, 0] / np.maximum(np.linalg.norm(q[:, :, 0], axis=-1, keepdims=True), 1e-300)
     second = q[:, :, 1] - np.sum(q[:, :, 1] * first, axis=-1, keepdims=True) * first
     second /= np.maximum(np.linalg.norm(second, axis=-1, keepdims=True), 1e-300)

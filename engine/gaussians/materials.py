@@ -57,7 +57,7 @@ def reflective_fraction(gaussians: FlatGaussians) -> float:
 
     Where there is next to none, nothing says how bright the environment is, nor what is metal.
     """
-    area = gaussians.opacities * np.prod(gaussians.scales, axis=1)
+    area = gaussians.opacities * np.prod(gaussians.scales, axis=1)  # up to a constant factor
     shows = (gaussians.channels[METALLIC][:, 0] > 0.5) & (gaussians.channels[ROUGHNESS][:, 0] < 0.5)
     total = float(area.sum(dtype=np.float64))
     return float(area[shows].sum(dtype=np.float64)) / total if total > 0 else 0.0

@@ -12,6 +12,7 @@ def morton_codes(points: Float[np.ndarray, "n 3"]) -> UInt64[np.ndarray, " n"]:
     """Return 63-bit Z-order codes of points in their central 98 % box; points outside are clamped to it."""
     if len(points) == 0:
         return np.zeros(0, np.uint64)
+    # Quantiles: a few far points would leave all others in one cell.
     low, high = np.quantile(points, [0.01, 0.99], axis=0)
     cell = (points - low) / np.maximum(high - low, 1e-30) * 2**_BITS
     grid = np.clip(cell, 0, 2**_BITS - 1).astype(np.uint64)

@@ -15,6 +15,7 @@ from jaxtyping import Float, Float32
 from octasplat.engine.gaussians.model import SH_C0
 
 ROWS_PER_BATCH = 65536
+# Degree 3 needs at least 7.
 SAMPLE_DIRECTIONS = 16
 
 
@@ -113,7 +114,7 @@ def sh_rotation_matrices(
 ) -> list[Float[np.ndarray, "n m m"]]:
     """Return orthogonal matrices that rotate the coefficients of degree 1 to ``degree``."""
     samples, inverses = _sample_directions()
-    values = sh_basis(np.einsum("nij,si->nsj", rotations.astype(np.float64), samples), degree)
+    values = sh_basis(np.einsum("nij,si->nsj", rotations.astype(np.float64), samples), degree)  # at O^T d
     return [
         np.einsum("ms,nsk->nmk", inverses[band], values[..., band**2 : (band + 1) ** 2])
         for band in range(1, degree + 1)

@@ -72,6 +72,7 @@ def resolve_image(mesh: Path, name: str) -> FileImage:
     folder = mesh.parent.resolve()
     plain = name.replace("\\", "/").strip()
     for candidate in (plain, plain.rsplit("/", 1)[-1]):
+        # Resolved, so that neither links nor .. lead out of the folder
         path = (folder / candidate).resolve()
         if candidate and path.is_relative_to(folder) and path.is_file():
             return FileImage(str(path), path.suffix, path=path)

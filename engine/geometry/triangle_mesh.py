@@ -74,6 +74,7 @@ class TriangleMesh:
         if self.normals_world is not None:
             return self.normals_world
         corners = self.face_corners_world
+        # Cross products are twice as long as triangles are large, which weights the sum.
         across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         sums = np.stack(
             [
@@ -93,7 +94,7 @@ class TriangleMesh:
         faces = self.faces[index]
         used = np.zeros(len(self.vertices_world), dtype=bool)
         used[faces.reshape(-1)] = True
-        new_index = np.cumsum(used, dtype=np.int32) - 1
+        new_index = np.cumsum(used, dtype=np.int32) - 1  # new number of each vertex that is used
         return replace(
             self,
             vertices_world=self.vertices_world[used],
@@ -136,8 +137,9 @@ def edge_report(faces: Int32[np.ndarray, "m 3"]) -> EdgeReport:
     forward = directed[:, 0] < directed[:, 1]
     if len(ordered) == 0:
         return EdgeReport(0, 0, 0)
-    key = ordered[:, 0].astype(np.int64) * (int(faces.max()) + 1) + ordered[:, 1]
+    key = ordered[:, 0].astype(np.int64) * (int(faces.max()) + 1) + ordered[:, 1]  # one number an edge
     _, place, counts = np.unique(key, return_inverse=True, return_counts=True)
+    # 0 where two triangles run along the edge in opposite directions, as in a consistent winding
     ways = np.bincount(place.reshape(-1), np.where(forward, 1.0, -1.0))
     return EdgeReport(
         int((counts == 1).sum()), int((counts > 2).sum()), int(((counts == 2) & (ways != 0)).sum())
