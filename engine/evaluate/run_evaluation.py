@@ -28,7 +28,7 @@ from octasplat.engine.poses.find_poses import read_pose_record
 from octasplat.engine.render.environment_files import read_environment
 from octasplat.engine.render.renderer import background_color
 from octasplat.engine.runs.config import ReconstructionConfig, read_config
-from octasplat.engine.runs.finished_shading import finished_shading
+from octasplat.engine.runs.finished_shading import finished_shading, shown_options
 from octasplat.engine.runs.run_folder import (
     CACHE,
     CONFIG,
@@ -41,9 +41,9 @@ from octasplat.engine.runs.run_folder import (
     open_run_dataset,
     photographs_folder,
     run_environment,
+    run_extent,
 )
 from octasplat.engine.trace.factory import make_tracer
-from octasplat.engine.train.shading_factory import ShadingOptions
 
 SCALES = "scales.json"
 ESTIMATED_EXPOSURE_NOTE = (
@@ -132,9 +132,9 @@ def evaluate_scales(
     dataset = _open_photographs(output, config, scene, threads, listener)
     _check_coordinates(output, dataset, photographs_folder(output, scene))
     gaussians, _ = read_gaussian_ply(output / SCENE)
-    extent = _extent_world(output, dataset)
+    extent = run_extent(output, dataset.extent)
     shading = finished_shading(
-        output, ShadingOptions.from_config(config.train), extent, [view.name for view in dataset.views]
+        output, shown_options(config.train, gaussians), extent, [view.name for view in dataset.views]
     )
     tracer = make_tracer(config.train.trace, threads=threads)
     tracer.build(gaussians, shading.features(gaussians))
@@ -190,11 +190,6 @@ def _check_coordinates(output: Path, dataset: Dataset, folder: Path) -> None:
         )
 
 
-def _extent_world(output: Path, dataset: Dataset) -> float:
-    """Return the scene extent that the run was trained with, regardless of the evaluated photographs."""
-    return read_views(output / VIEWS).extent_world if (output / VIEWS).exists() else dataset.extent
-
-
 def measure_run(
     dataset: Dataset,
     output: Path,
@@ -210,7 +205,7 @@ def measure_run(
     """
     truth = _find_ground_truth(dataset, progress, needed=into is not None)
     gaussians, _ = read_gaussian_ply(output / SCENE)
-    extent = _extent_world(output, dataset)
+    extent = run_extent(output, dataset.extent)
     environment = _read_run_environment(output, config.train.materials.up_world)
     relighter = None
     if truth is not None and truth.relit_folders and environment is not None and has_materials(gaussians):
@@ -225,7 +220,7 @@ def measure_run(
         settings=config.train.trace,
         shading=finished_shading(
             output,
-            ShadingOptions.from_config(config.train),
+            shown_options(config.train, gaussians),
             extent,
             [view.name for view in dataset.views] if into is None else (),
         ),

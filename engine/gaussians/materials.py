@@ -10,8 +10,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool
 
 from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.gaussians.channels import FILL_VALUE, stack_channels
 from octasplat.engine.gaussians.model import FlatGaussians
 
 ALBEDO, METALLIC, ROUGHNESS = "albedo", "metallic", "roughness"
@@ -33,6 +35,17 @@ def has_materials(gaussians: FlatGaussians) -> bool:
     """Return whether a scene has all three channels of a material, each of its width."""
     widths = gaussians.channels.widths
     return all(widths.get(name) == width for name, width in MATERIAL_WIDTHS.items())
+
+
+def is_material_known(gaussians: FlatGaussians) -> Bool[np.ndarray, " n"]:
+    """Return which Gaussians have a material; those that came from a scene without have 0 in all channels.
+
+    The ambient visibility, where there is one, tells them from a black mirror that somebody made.
+    """
+    if not has_materials(gaussians):
+        return np.zeros(len(gaussians), np.bool_)
+    names = [*MATERIAL_WIDTHS, *(name for name in (AMBIENT,) if name in gaussians.channels)]
+    return np.asarray((stack_channels(gaussians.channels, names) != FILL_VALUE).any(axis=1))
 
 
 def require_materials(gaussians: FlatGaussians, path: Path) -> None:

@@ -36,11 +36,12 @@ from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.render.renderer import background_color
 from octasplat.engine.render.shots import Shot, gaussian_turntable, view_shots
 from octasplat.engine.runs.config import read_config
-from octasplat.engine.runs.finished_shading import finished_shading
+from octasplat.engine.runs.finished_shading import finished_shading, shown_options
 from octasplat.engine.runs.run_folder import (
     CONFIG,
     SCENE,
     is_run,
+    run_extent,
     run_min_view_distance,
     run_viewpoints,
 )
@@ -50,6 +51,7 @@ from octasplat.engine.trace.protocol import TraceSettings
 from octasplat.engine.train.shading_factory import ShadingOptions, find_background, find_deferred
 
 _NO_LIGHT = "a file does not hold the light that its materials were learnt in."
+_SOME_WITHOUT = "some of its Gaussians came from a scene without materials, so that harmonics are shown."
 ANY_SIDE_PX = 1 << 30
 """A cap that no photograph reaches."""
 
@@ -149,12 +151,16 @@ def read_render_source(
     viewpoints = run_viewpoints(source, scene=dataset, max_side=max_side)
     photographs = run_viewpoints(source, scene=dataset, max_side=ANY_SIDE_PX) if full_size else None
     gaussians = read_gaussian_ply(source / SCENE)[0]
-    options = ShadingOptions.from_config(config.train)
-    if shading == "materials" and (options.materials is None or not has_materials(gaussians)):
-        raise ConfigError(f"{source} has learnt no materials; leave out `shading`.")
-    if shading == "harmonics" or not has_materials(gaussians):  # edits may have left them out
+    options = shown_options(config.train, gaussians)
+    if shading == "materials":
+        options = ShadingOptions.from_config(config.train)
+        if options.materials is None or not has_materials(gaussians):
+            raise ConfigError(f"{source} has learnt no materials; leave out `shading`.")
+    elif shading == "harmonics":
         options = replace(options, materials=None)
-    learnt = finished_shading(source, options, viewpoints.extent)
+    elif options.materials is None and config.train.materials.learn and has_materials(gaussians):
+        progress(Noted(f"{source}: {_SOME_WITHOUT}"))
+    learnt = finished_shading(source, options, run_extent(source, viewpoints.extent))
     facts = read_metadata(source)
     return RenderSource(
         gaussians=gaussians,

@@ -4,9 +4,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from octasplat.engine.gaussians.materials import is_material_known
+from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.render.environment_files import read_background_map, read_environment
 from octasplat.engine.runs.run_folder import BACKGROUND, run_environment, run_exposures
 from octasplat.engine.shading.protocol import ShadingModel
+from octasplat.engine.train.config import TrainConfig
 from octasplat.engine.train.shading_factory import (
     ShadingOptions,
     find_background,
@@ -14,6 +17,15 @@ from octasplat.engine.train.shading_factory import (
     find_exposures,
     make_shading,
 )
+
+
+def shown_options(config: TrainConfig, gaussians: FlatGaussians) -> ShadingOptions:
+    """Return what a run has learnt, without materials where its scene has none, or only some of it has.
+
+    Edits may have left them out, or put a scene without materials to it, of which harmonics alone are known.
+    """
+    options = ShadingOptions.from_config(config)
+    return options if is_material_known(gaussians).all() else replace(options, materials=None)
 
 
 def finished_shading(

@@ -117,6 +117,11 @@ def run_origin(output: Path) -> Origin | None:
     return read_views(output / VIEWS).origin_world if (output / VIEWS).exists() else None
 
 
+def run_extent(output: Path, other: float) -> float:
+    """Return the scene extent that a run was trained with; ``other`` of a run of old, which keeps none."""
+    return read_views(output / VIEWS).extent_world if (output / VIEWS).exists() else other
+
+
 def run_min_view_distance(output: Path, viewpoints: SplitViewpoints) -> float:
     """Return the distance from a camera at which anything of a run's scene is seen, as in its training.
 
