@@ -86,7 +86,7 @@ def build_reconstruction(records: ModelRecords) -> tuple[Any, int]:
         model.add_camera_with_trivial_rig(made)
     for image in records.images.values():
         w, x, y, z = image.quaternion_wxyz
-        # its quaternions end with w
+        # Quaternions of pycolmap end with w.
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([x, y, z, w])), np.array(image.translation))
         model.add_image_with_trivial_frame(
             pycolmap.Image(

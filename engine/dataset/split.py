@@ -50,7 +50,7 @@ def split_views(
                 f"({', '.join(unknown[:3])}); give names as they stand there."
             )
         is_chosen = np.array([normalize_name(name) in chosen for name in names], dtype=bool)
-        # Whoever shares a unit with a chosen view is held out with it.
+        # A view that shares a unit with a chosen one is held out with it.
         is_test = np.isin(unit, unit[is_chosen])
     else:
         is_test = unit % test_every == 0 if test_every else np.zeros(len(names), dtype=bool)

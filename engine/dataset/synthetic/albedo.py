@@ -200,7 +200,7 @@ def tower_bricks(xyz: TexturePoints, uv: UvCoordinates) -> Colors:
     mortar = np.maximum(box_mask(np.mod(course, 1), 0.0, 0.13), box_mask(np.mod(along, 1), 0.0, 0.06))
     colors = lerp(colors, linear_from_hex("cfc6b4"), mortar)
     sign = box_mask(v, 0.30, 0.40)
-    # From the middle of a side, in metres: u has 10 m a side
+    # From the middle of a side, in meters: u has 10 m a side
     across = np.mod(u + 5, 10) - 5
     ink = text_mask(across / 0.042 + 2.5, (v - 0.386) / 0.1, ["SPLAT"]) * box_mask(across, -0.104, 0.104)
     return lerp(colors, lerp(linear_from_hex("f5efe0"), linear_from_hex("22333b"), ink), sign)
