@@ -82,6 +82,7 @@ def create_app(settings: ServiceSettings | None = None) -> FastAPI:
     """
     settings = settings or ServiceSettings()
     settings.checked()
+    # Before the routes, whose document lists every kind of job.
     for module in settings.kind_modules:
         importlib.import_module(module)
 
@@ -129,6 +130,7 @@ def create_app(settings: ServiceSettings | None = None) -> FastAPI:
         longer={scene_previews.PREFIX: scene_previews.MAX_BODY_BYTES},
     )
     app.add_middleware(SameOriginMiddleware)
+    # One that others can reach has names that nobody has listed.
     if settings.is_private:
         app.add_middleware(AllowedHostsMiddleware, names=settings.allowed_hosts)
     app.add_middleware(MessageFramingMiddleware)
@@ -144,6 +146,7 @@ def create_app(settings: ServiceSettings | None = None) -> FastAPI:
 async def _service_lifespan(settings: ServiceSettings) -> AsyncIterator[Service]:
     """Open the database, storage and event listener for the lifespan of the application."""
     conninfo = settings.conninfo()
+    # The front end brings the tables up to date, for which workers wait.
     await asyncio.to_thread(migrate, conninfo)
     storage = await asyncio.to_thread(
         lambda: open_storage(settings.storage_address, floor_bytes=settings.floor_bytes)

@@ -46,6 +46,7 @@ class AuditMiddleware(HttpMiddleware):
         try:
             await self._app(scope, receive, send_and_record)
         except Exception:
+            # The answer to it is made further out, and does not come by here.
             await record(500, Headers())
             raise
 

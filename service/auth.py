@@ -85,6 +85,7 @@ async def authenticate(
         ProblemError: 401 without a valid token or session, 429 after too many wrong tokens.
     """
     principal = None
+    # A header wins over the cookie that a browser sends along.
     if bearer is not None:
         token = await authenticate_token(request, service, bearer.credentials)
         principal = None if token is None else Principal(token.owner, frozenset(token.scopes), token.id)

@@ -128,6 +128,7 @@ def _stored_response(
     if service.storage.stat(sha256).size_bytes != size or (is_small and not _is_sound(service, sha256)):
         raise _damaged(sha256)
     path = service.storage.local_path(sha256)
+    # A whole large content goes on below, where it is compared while it is sent.
     if path is not None and (is_small or ranges is not None or request.method == "HEAD"):
         return _StoredFileResponse(path, ranges, media_type, headers)
     start, stop, status = 0, size, 200
@@ -199,6 +200,7 @@ class _StoredFileResponse(FileResponse):
 def _content_disposition(name: str, inline: bool) -> str:
     """Return the Content-Disposition header (RFC 6266)."""
     last = PurePosixPath(name).name
+    # For clients that do not know filename*.
     plain = re.sub(r"[^A-Za-z0-9._ -]", "_", last)
     kind = "inline" if inline else "attachment"
     if plain == last:

@@ -97,6 +97,7 @@ class EventBroker:
             await asyncio.sleep(_RECONNECT_SECONDS)
 
     async def _listen_once(self) -> None:
+        # Not one of the pool, as listening takes it for good.
         connection = await psycopg.AsyncConnection.connect(
             make_conninfo(self._conninfo, **KEEPALIVES), autocommit=True, connect_timeout=10
         )

@@ -88,6 +88,7 @@ def find_excess(body: bytes, max_values: int = MAX_VALUES) -> tuple[str, str] | 
     if json.detect_encoding(body) not in ("utf-8", "utf-8-sig"):
         return "encoding", "JSON is read in UTF-8 only."  # the parser takes others, whose brackets differ
     too_many = ("too_many_values", f"The request has more than {max_values} values.")
+    # Texts are cut out first, as brackets and commas within them are none.
     pieces, end = [], 0
     for number, found in enumerate(_STRING.finditer(body)):
         if number > 2 * max_values:  # each is a value or a name

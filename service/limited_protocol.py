@@ -53,7 +53,6 @@ class ConnectionTable:
             ranked = sorted(self._by_client.values(), key=len, reverse=True)
             if not any(_close_longest_waiting(group) for group in ranked):
                 return False
-        # A dictionary in the place of a set, as it keeps the order.
         of_client[connection] = None
         self._count += 1
         return True
@@ -125,6 +124,7 @@ class LimitedProtocol(H11Protocol):
         super().connection_made(transport)
         self.address = self.client[0] if self.client is not None else ""
         if not self._table.add(self):
+            # Without the application, as the connection is refused before its request is read.
             transport.write(_answer("503 Service Unavailable", "Retry-After: 5\r\n"))
             transport.close()
 
@@ -155,6 +155,7 @@ class LimitedProtocol(H11Protocol):
             if seconds > limits.body_seconds:
                 self.transport.close()
         elif not self.is_waiting_for_request:
+            # Time that the service itself takes for an answer is not the client's.
             self._restart_clock()
 
     def _close_if_not_reading(self, reader_seconds: float) -> None:

@@ -40,6 +40,7 @@ class Metrics:
             gauges["octasplat_storage_free_bytes"] = (
                 "Room in the store above the floor; negative below it.", float(free_bytes)
             )  # fmt: skip
+        # Counters of the process are kept; the figures of the tables are made anew for each request.
         now = CollectorRegistry()
         now.register(
             _FixedCollector([*_table_metrics(stats), *(GaugeMetricFamily(n, *g) for n, g in gauges.items())])

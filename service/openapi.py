@@ -33,6 +33,7 @@ def extend_openapi(app: FastAPI) -> None:
                 document = original()
                 schemas = document["components"]["schemas"]
                 schemas["ProblemDocument"] = ProblemDocument.model_json_schema()
+                # Those that FastAPI answers with by itself, which no route of this service does.
                 for name in ("HTTPValidationError", "ValidationError"):
                     schemas.pop(name, None)
                 add_option_schemas(schemas)
@@ -105,6 +106,7 @@ def _new_job_schema(
     properties = dict(plain["properties"])
     properties["kind"] = {"type": "string", "const": kind.name, "title": "Kind", "default": kind.name}
     properties["options"] = {**options, "description": f"See GET /v1/options/{kind.name}."}
+    # The kind that is meant where none is named need not be.
     required = [] if kind.name == _DEFAULT_KIND else ["kind"]
     if kind.user_options.model_json_schema().get("required"):
         required.append("options")

@@ -49,6 +49,7 @@ class ProxyHeadersMiddleware:
                 scope["scheme"] = hop["proto"]
             if hop.get("host"):
                 others = [(name, value) for name, value in scope["headers"] if name != b"host"]
+                # ASGI has headers as bytes, and those of HTTP are Latin-1.
                 scope["headers"] = [(b"host", hop["host"].encode("latin-1", "replace")), *others]
             address = _parse_host_address(hop.get("for", ""))
             if address is None:

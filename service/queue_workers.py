@@ -58,6 +58,7 @@ def queued_job_notes(
 ) -> list[str]:
     """Return sentences for the owner of a queued job."""
     if workers:
+        # A worker that does not tell its kinds is taken to know this one.
         takers = [row for row in workers if kind.name in row.facts.get("kinds", (kind.name,))]
         if takers:
             return _refusing_workers_note(queue, takers)

@@ -44,6 +44,7 @@ def requested_ranges(request: Request, etag: str, size_bytes: int) -> list[tuple
         if suffix is not None:
             start, stop = max(0, size_bytes - int(suffix)), size_bytes
         else:
+            # A range names its last byte, and ``stop`` is the one behind it.
             start, stop = int(first), min(size_bytes, int(last) + 1) if last else size_bytes
             if last and int(last) < start:
                 raise ProblemError(400, "range", "A range of the header Range ends before it begins.")

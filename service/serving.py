@@ -92,6 +92,7 @@ def main() -> int:
         family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
         # With the protocol named, asyncio turns Nagle's algorithm off; answers would take 40 ms more.
         listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+        # Else a restart would have to wait until the system forgets the connections of before.
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             listener.bind((settings.host, settings.port))
@@ -126,6 +127,7 @@ def main() -> int:
         gc.freeze()
         if is_alone:
             server.on_start = partial(log_missing_capabilities, settings.job_uids)
+        # So uvicorn ends where the application does not start, of which is told below.
         with contextlib.suppress(SystemExit):
             asyncio.run(server.serve(sockets=[listener]))
         if (failure := _startup_error(app)) is not None:

@@ -27,6 +27,7 @@ MAX_WAIT_SECONDS = 50
 """An answer waits no longer for a task, as usual proxies give up after 60 s."""
 _BODY_SECONDS = 90.0
 """Longer than an upload may be silent, which is answered with a problem."""
+# Characters that a secret may be made of, and how many they are; the first pattern that fits counts.
 _ALPHABETS = (("[0-9]*", 10), ("[0-9a-f]*|[0-9A-F]*", 16), ("[0-9a-z]*|[0-9A-Z]*", 36))
 _MIN_DISTINCT_CHARACTERS = 8
 """A text of fewer is none that was drawn at random."""
@@ -163,6 +164,7 @@ class ServiceSettings(WorkerSettings):
     def ceilings(self) -> dict[str, int]:
         """Return the limits of jobs, by the names in ``LIMIT_UNITS``."""
         found = {name: getattr(self, f"max_{name}") for name in LIMIT_UNITS}
+        # 0 sets no limit.
         return found if self.max_workspace_bytes else {**found, "workspace_bytes": 1 << 62}
 
     def upload_limits(self) -> UploadLimits:

@@ -205,6 +205,7 @@ async def _store_if_whole(service: Service, upload: FileUpload) -> FileUpload:
         The upload as it is.
     """
     async with service.pool.connection() as connection, connection.transaction():
+        # Of two requests that bring the end at once, only one begins the task.
         found = await rows.get_upload(connection, upload.id, lock=True)
         if found is None:
             raise not_found_error("upload")

@@ -162,6 +162,7 @@ async def _create_job(
     connection: Connection, service: Service, principal: Principal, requested: _RequestedJob
 ) -> uuid.UUID:
     new, kind = requested.new, requested.kind
+    # Before the rows of the inputs are locked, see workers.db.locks.
     await lock_owner(connection, principal.owner)
     inputs = await _check_inputs(connection, principal, requested)
     await check_new_job(connection, principal.owner, service.settings.quota)
@@ -219,6 +220,7 @@ async def _check_source(connection: Connection, principal: Principal, requested:
     if source is None or not principal.may_see(source.owner):
         raise input_problem("source_id", "There is no such job.")
     names = {artifact.name for artifact in await rows.artifacts_of(connection, source.id)}
+    # A job that failed may have finished a scene before.
     if source.state != "succeeded" and not (source.state == "failed" and names):
         raise ProblemError(409, "source", f"The job in source_id is {source.state} and has no results.")
     if kind.source_files and kind.source_files[0] not in names:
@@ -234,6 +236,7 @@ async def _check_source(connection: Connection, principal: Principal, requested:
             "The scene of the job in source_id is not where photographs show it; name some as dataset_id."
         )
         raise input_problem("source_id", detail)
+    # Where the result has moved, the photographs do not show it any more.
     return _JobInputs(source.dataset_id if kind.keeps_world_frame else None, source.id, requested.options)
 
 

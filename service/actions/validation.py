@@ -87,6 +87,7 @@ def _revise(
         if before.requested is None:
             return ResolvedOptions(revised, None)
         requested = kind.revise_requested(before.requested, kind.as_requested(changes))
+        # A job that begins anew gets the presets and defaults of this version.
         return ResolvedOptions(revised if is_resumed else resolve_requested(kind, requested), requested)
     except (ValidationError, InvalidSettingsError) as error:
         raise options_error(error) from None

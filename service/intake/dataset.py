@@ -115,6 +115,7 @@ def check_dataset(
     faults: list[IntakeFault] = []
     warnings: list[str] = []
     _check_file_names(files, faults)
+    # All that follows goes by the names.
     if faults:
         raise IntakeError(*faults[:_MAX_FAULTS])
     sizes = _image_sizes(storage, files, limits.image, faults, warnings)
@@ -129,6 +130,7 @@ def check_dataset(
         if file_role(file.path) is FileRole.MODEL
     ]
     answer = ModelAnswer()
+    # Last, and only where all else is sound, as it takes a process of its own.
     if model and not faults:
         answer = check_model(storage, model, photographs, limits.model)
         faults += answer.faults

@@ -66,7 +66,9 @@ def _is_jpeg_complete(file: BinaryIO, size_bytes: int) -> bool:
             return False
         if b"\xff\xd9" in last + piece:
             return True
+        # The two bytes of the marker may lie in two pieces.
         last = piece[-1:]
+    # More than is looked through: not known to be cut off.
     return True
 
 
@@ -93,6 +95,7 @@ def _is_png_complete(file: BinaryIO, size_bytes: int) -> bool:
     file.seek(max(0, size_bytes - 12))
     if file.read(12)[4:8] == b"IEND":
         return True
+    # Some programs write behind the end chunk, which is looked for from the beginning then.
     file.seek(8)
     for _ in range(_MAX_SEGMENTS):
         length, kind = unpack_struct(file, ">I4s")

@@ -25,6 +25,7 @@ _SUFFIXES = {
     "JPEG": (".jpg", ".jpeg"), "PNG": (".png",), "TIFF": (".tif", ".tiff"), "WebP": (".webp",),
     "BMP": (".bmp",), "EXR": (".exr",), "HDR": (".hdr",),
 }  # fmt: skip
+# What the plugins of Pillow, and struct, raise where a file is damaged.
 _HEADER_ERRORS = (
     OSError, SyntaxError, ValueError, ArithmeticError, LookupError, TypeError, AttributeError, RuntimeError,
     MemoryError, struct.error,
@@ -140,6 +141,7 @@ class _BoundedFile(io.RawIOBase):
     def __init__(self, file: BinaryIO, max_bytes: int) -> None:
         self._file = file
         self._bytes_left = max_bytes
+        # Many small reads take long although they read little.
         self._calls_left = 200_000
         self._file.seek(0)
 

@@ -91,6 +91,7 @@ def check(request: ModelRequest) -> ModelAnswer:
     checker = _ModelChecker(request)
     try:
         folder = find_model(request.root)
+        # Faults name files of the model that was chosen, of which there may be several.
         own = {
             Path(path).name: name
             for path, name in request.files.items()
@@ -257,6 +258,7 @@ def _without_root(sentence: str, root: Path) -> str:
 
 def _enter_sandbox(request: ModelRequest) -> None:
     """Give up rights that a parser does not need, for good."""
+    # The parent ends it where it takes too long, unless it was killed itself.
     with contextlib.suppress(OSError):
         prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     for kind, value in (

@@ -211,6 +211,7 @@ async def _limited_in_time(stream: AsyncIterator[bytes], limits: UploadLimits) -
             raise IntakeError(IntakeFault("upload-stalled", detail)) from None
         waited_seconds += time.monotonic() - began
         arrived_bytes += len(piece)
+        # Each stretch of so many seconds is judged by itself, so that a fast beginning excuses nothing.
         if waited_seconds >= seconds:
             if arrived_bytes < limits.min_bytes_per_second * waited_seconds:
                 detail = (
@@ -328,6 +329,7 @@ def _unpack_archive(
     if max_bytes is not None and listing.size_bytes > max_bytes:
         detail = f"The archive unpacks to {listing.size_bytes} bytes; {max_bytes} are left of your quota."
         raise IntakeError(IntakeFault("archive-too-large", detail))
+    # All of it has to fit before the first file is written.
     storage.ensure_space(listing.size_bytes)
     files: list[ReceivedFile] = []
 

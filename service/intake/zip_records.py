@@ -71,6 +71,7 @@ def read_records(file: BinaryIO, *, max_entries: int, max_directory_bytes: int) 
     """
     entries, directory_start = _read_directory(file, max_entries, max_directory_bytes)
     records = [_with_local_header(file, *entry) for entry in entries]
+    # In the order of their data, in which gaps and overlaps show.
     records.sort(key=lambda record: record.header_start)
     _check_coverage(file, records, directory_start)
     return records

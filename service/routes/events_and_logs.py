@@ -68,11 +68,13 @@ async def stream_events(
 ) -> Response:  # fmt: skip
     """Stream the job's events; after a break, `Last-Event-ID` names the last one received."""
     if last_event_id is not None and last_event_id.isdecimal():
+        # No event has a number above what the database can hold.
         after = min(int(last_event_id), (1 << 62) - 1)
     address = client_address(request)
     events = await actions.follow_events(service, principal, job_id, after=after, address=address)
     if events is None:
         return Response(status_code=204)
+    # nginx would collect events otherwise, and pass them on late.
     headers = {"Cache-Control": "no-cache", "X-Accel-Buffering": "no"}
     return StreamingResponse(_encode_stream(events), media_type="text/event-stream", headers=headers)
 
@@ -80,7 +82,7 @@ async def stream_events(
 async def _encode_stream(events: AsyncGenerator[JobEvent | None, None]) -> AsyncIterator[bytes]:
     """Yield events in their wire format, with keep-alive comments between them."""
     async with aclosing(events):
-        yield b"retry: 2000\n\n"
+        yield b"retry: 2000\n\n"  # a client connects again after 2 s
         async for event in events:
             yield b": ping\n\n" if event is None else _encode_event(event)
 

@@ -146,6 +146,7 @@ async def delete_job(
 
 def _job_etag(job: JobWithView) -> str:
     view = job.view
+    # The version of the row counts neither other jobs of the queue nor what the notes say of workers.
     place = "" if view.queue_position is None else f".{view.queue_position}.{len(view.notes)}"
     return f'"{job.row.version}{place}"'
 

@@ -79,6 +79,7 @@ async def preview_scene_archive(
         preview = await run_in_pool(
             ThreadPurpose.UNPACKING,
             preview_archive,
+            # No more than the whole has, whatever was sent.
             end[-size_bytes:],
             size_bytes,
             service.settings.upload_limits(),

@@ -39,6 +39,7 @@ def receive_job_event(
 
 for _event in get_args(EventName):
     _name = f"on{''.join(word.title() for word in _event.split('.'))}"
+    # What FastAPI calls the path of such a route is the name of the message in the document.
     router.add_api_route(_event, receive_job_event, methods=["POST"], operation_id=_name, responses=_ANSWERS)
 
 

@@ -89,6 +89,7 @@ def _pose_of_view(view: Mapping[str, Any], cameras: Sequence[Mapping[str, Any]])
     translation = np.array(view["translation_cam_from_world"], np.float64)
     if intrinsics is None or not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
         return None
+    # A point of the world is R p + t in the camera, so that the camera's own place is -R' t.
     centre = -rotation.T @ translation
     return PhotographPose(str(view["name"]), rotation, centre, intrinsics.fov_y_degrees, intrinsics.aspect)
 
@@ -114,6 +115,7 @@ def viewer_cameras(
     forwards = rotations[:, 2]
     up = estimate_up(rotations)
     middle = centres.mean(axis=0)
+    # All cameras at one place: any length will do.
     spread = float(np.linalg.norm(centres - middle, axis=1).mean()) or 1.0
     # Least squares of the distances to the axes; the small term keeps parallel axes solvable.
     across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]
@@ -127,6 +129,7 @@ def viewer_cameras(
     if np.median(depth) < 0.1 * spread:
         target, depth = ahead, np.einsum("ij,ij->i", ahead - centres, forwards)
     held = set(held_out)
+    # Every N-th of many, and in any case those that are held out.
     step = -(-len(poses) // MAX_VIEWS)
     selected = [pose for k, pose in enumerate(poses) if k % step == 0 or pose.name in held][:MAX_VIEWS]
     return {
@@ -138,6 +141,7 @@ def viewer_cameras(
                 "name": pose.name,
                 "position": _round_values(pose.centre_world),
                 "forward": _round_values(pose.rotation_cam_from_world[2]),
+                # The second row is the camera's down.
                 "up": _round_values(-pose.rotation_cam_from_world[1]),
                 "fov_y_degrees": round(pose.fov_y_degrees, 4),
                 "aspect": round(pose.aspect, 5),
@@ -208,6 +212,7 @@ def _read_images_bin(file: IO[bytes]) -> Iterator[_ImageRecord]:
     (count,) = _unpack(file, "<Q")
     _check_record_count(count)
     for _ in range(count):
+        # The id of the image, quaternion and translation, the id of the camera.
         _, *numbers, camera_id = _unpack(file, "<i7di")
         name = bytearray()
         while (letter := _read_exactly(file, 1)) != b"\0":
@@ -215,6 +220,7 @@ def _read_images_bin(file: IO[bytes]) -> Iterator[_ImageRecord]:
             if len(name) > _MAX_NAME_BYTES:
                 raise ValueError("a name without end")
         (points,) = _unpack(file, "<Q")
+        # 24 bytes an observation: x, y and the id of its point.
         file.seek(24 * points, io.SEEK_CUR)
         yield [float(number) for number in numbers], camera_id, name.decode()
 
@@ -239,6 +245,7 @@ def _read_images_txt(file: IO[bytes]) -> Iterator[_ImageRecord]:
     """Yield the records of COLMAP's ``images.txt``."""
     lines = _text_lines(file)
     for line in lines:
+        # The name is the rest of the line, as it may hold spaces.
         words = line.split(maxsplit=9)
         if not words:
             continue

@@ -146,6 +146,7 @@ def _variant_fields(
         kind = str(variant["properties"]["kind"]["const"])
         kinds.append(Choice(kind, kind))
         for item in _walk_schema(root, variant, f"{path}.", presets):
+            # A field that several variants have is shown once.
             inner.setdefault(item.path, (item, []))[1].append(kind)
     values = {name: _value_at(values, f"{path}.kind") for name, values in presets.items()}
     yield FormField(
@@ -247,6 +248,7 @@ def _resolve_reference(root: Mapping[str, Any], schema: Mapping[str, Any]) -> Ma
     """Return the schema with its reference followed, and with the null of an optional value left out."""
     if "$ref" in schema:
         target: Mapping[str, Any] = root["$defs"][schema["$ref"].rpartition("/")[2]]
+        # What stands beside a reference, such as a description, wins over what it leads to.
         return {**target, **{key: value for key, value in schema.items() if key != "$ref"}}
     if "anyOf" in schema:
         others = [option for option in schema["anyOf"] if option.get("type") != "null"]

@@ -9,7 +9,7 @@ def format_size(count: int) -> str:
     """Return a number of bytes, in decimal units."""
     value = float(count)
     for unit in _UNITS:
-        if value < 999.5 or unit == _UNITS[-1]:
+        if value < 999.5 or unit == _UNITS[-1]:  # else it would be rounded to 1000
             break
         value /= 1000
     digits = 0 if unit == "B" or value >= 99.5 else 1

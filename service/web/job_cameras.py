@@ -56,6 +56,7 @@ def _posed_cameras(
     names = read_names(service.storage, held_out)
     by_name = {row.name: row for row in artifacts}
     content = read_json(service.storage, by_name.get(VIEWS))
+    # A training under way has no results yet, but its live scene has cameras.
     if not content and live is not None:
         content = read_json_content(service.storage, live.views_sha256)
         names = [str(view.get("name")) for view in content.get("views", ()) if view.get("held_out")]

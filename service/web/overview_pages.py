@@ -116,6 +116,7 @@ async def change_chosen_jobs(
     body = (await request.body())[:_MAX_FORM_BYTES].decode(errors="replace")
     refusals = []
     for text in urllib.parse.parse_qs(body).get("job", ()):
+        # What can be done is done, and all refusals are told together at the end.
         try:
             job_id = uuid.UUID(text)
             if do == "cancel":

@@ -143,6 +143,7 @@ async def show_report(
     response = await send_blob(
         service, request, row.sha256, row.size_bytes, media_type="text/html", name=REPORT, inline=True
     )
+    # In the place of that of send_blob, under which no script runs.
     response.headers["Content-Security-Policy"] = _REPORT_POLICY
     return response
 
@@ -237,6 +238,7 @@ async def _updated_page(
     """Return the changed parts of the page that sent the request."""
     if not is_htmx_request(request):
         return redirect(request, f"/jobs/{job_id}")
+    # The list loads itself anew at the event, so that nothing is replaced here.
     if request.query_params.get("in") == "list":
         return Response(status_code=200, headers={"HX-Reswap": "none", "HX-Trigger": "jobs-changed"})
     detail = await job_detail(service, principal, job_id)
@@ -265,6 +267,7 @@ def _up_world(config: dict[str, object]) -> str:
 
 def _evaluation_background(config: dict[str, object]) -> object:
     found = _config_value(config, "reconstruction", "evaluation_background")
+    # The second name is that of the version before.
     return found or _config_value(config, "reconstruction", "evaluate_background") or "black"
 
 

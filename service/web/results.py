@@ -168,6 +168,7 @@ def read_measurements(
     results = {row.name for row in artifacts}
     files = {file.path for file in photographs}
     views = []
+    # The name of a render depends on all photographs, as two may differ by their suffix alone.
     for (name, row), rendered in zip(rows.items(), unique_render_names(list(rows)), strict=True):
         render = f"renders/{rendered}.png"
         photograph = f"images/{name}"
@@ -183,6 +184,7 @@ def read_measurements(
                     for layer in LAYERS
                     if (name := render.replace("renders/", f"layers/{layer}/", 1)) in results
                 },
+                # The usual shape of a photograph where the size is not known.
                 width=int(_finite_number(row.get("width")) or 4),
                 height=int(_finite_number(row.get("height")) or 3),
             )
@@ -271,6 +273,7 @@ def _group_and_use(name: str) -> tuple[str, str]:
     lower = name.lower()
     if name in _USE_BY_NAME:
         return _USE_BY_NAME[name]
+    # Before the suffix, which meshes have too.
     if _holds_splats(name):
         return _SCENE, "three.js, PlayCanvas, Babylon.js: Gaussians by KHR_gaussian_splatting"
     if lower.endswith(("mesh.ply", OCTAGONS_PLY.name)):

@@ -37,6 +37,7 @@ class PageRoute(APIRoute):
             except ProblemError as problem:
                 return _error_response(request, problem)
             except RequestValidationError:
+                # An address with a part that fits no route's types is that of no page.
                 return _error_response(request, not_found_error("page"))
             except OctasplatError as error:
                 return _error_response(request, problem_from_error(error))
@@ -72,6 +73,7 @@ def is_htmx_request(request: Request) -> bool:
 
 def redirect(request: Request, address: str) -> Response:
     """Send the browser to another page."""
+    # htmx would follow a redirection itself, and put the page into the part that asked.
     if is_htmx_request(request):
         return Response(headers={"HX-Redirect": address, "HX-Reswap": "none"})
     return RedirectResponse(address, 303)
@@ -79,6 +81,7 @@ def redirect(request: Request, address: str) -> Response:
 
 def safe_local_path(address: str | None) -> str:
     """Return ``address`` if it is a path on this site, else the first page."""
+    # Browsers take //host and /\host for other sites.
     if not address or not address.startswith("/") or address[1:2] in ("/", "\\"):
         return "/"
     return address if address.isprintable() else "/"
@@ -86,6 +89,7 @@ def safe_local_path(address: str | None) -> str:
 
 def _error_response(request: Request, problem: ProblemError) -> Response:
     if problem.status == 401:
+        # After the sign-in to the page that was asked for, not to an action or a part of a page.
         where = request.url.path if request.method == "GET" and not is_htmx_request(request) else "/"
         if is_htmx_request(request):
             where = urllib.parse.urlsplit(request.headers.get("hx-current-url", "/")).path

@@ -70,6 +70,7 @@ class SceneServer:
 
 
 class _SceneHttpServer(ThreadingHTTPServer):
+    # A connection that a browser keeps open does not hold up the end.
     daemon_threads = True
 
     def __init__(self, scene: ViewedScene, port: int) -> None:
@@ -110,6 +111,7 @@ class _SceneHandler(BaseHTTPRequestHandler):
             self._send_asset(path)
 
     def _send_asset(self, path: str) -> None:
+        # Resolved before it is judged, as ``..`` or a link may lead out of the folder.
         file = (STATIC_FOLDER / path.removeprefix("/static/")).resolve()
         if (
             not path.startswith("/static/")

@@ -53,6 +53,7 @@ async def sign_in_once(
     request: Request, service: ServiceDep, key: Annotated[str, Query(max_length=100)] = ""
 ) -> Response:
     """Begin a session with a sign-in link, which is used up."""
+    # A GET that changes something, which the audit would leave out.
     request.state.is_change = True
     async with service.pool.connection() as connection:
         token_id = await use_link(connection, key)
@@ -81,6 +82,7 @@ async def sign_out(request: Request, service: ServiceDep) -> Response:
         async with service.pool.connection() as connection:
             await end_session(connection, secret)
     response = redirect(request, "/sign-in")
+    # Under both names, as the session may have begun with or without TLS.
     response.delete_cookie(SESSION_COOKIE, httponly=True, samesite="strict")
     response.delete_cookie(SECURE_SESSION_COOKIE, httponly=True, samesite="strict", secure=True)
     return response

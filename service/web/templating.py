@@ -74,6 +74,7 @@ def _jinja_environment() -> Any:
     environment = Environment(
         loader=PackageLoader("octasplat.service.web"),
         autoescape=select_autoescape(["html"]),
+        # A name that a template gets wrong is an error, and no empty place.
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,

@@ -41,6 +41,7 @@ def build_vendor_files(target: Path = VENDOR_FOLDER) -> None:
             _bundle_modules(modules, folder / f"{bundle}.js", made / f"{bundle}.js")
         for copy, source in COPIES.items():
             text = (modules / source).read_text(encoding="utf-8")
+            # The source maps that these lines name are left out.
             lines = [line for line in text.splitlines() if not line.startswith("//# sourceMappingURL")]
             (made / copy).write_text("\n".join(lines) + "\n", encoding="utf-8")
         (made / "LICENSES.txt").write_text(_licence_texts(modules), encoding="utf-8")

@@ -129,6 +129,7 @@ async def job_detail(service: Service, principal: Principal, job_id: uuid.UUID) 
                 ),
                 [job_id, _MAX_EVENTS],
             )
+            # The newest so many, shown from the oldest on.
             events = (await cursor.fetchall())[::-1]
     # After a start from nothing, or by another worker, stages are gone through again.
     current = [event for event in events if event.attempt == job.attempt]
@@ -176,6 +177,7 @@ async def _job_rows(service: Service, connection: Connection, jobs: Sequence[Job
             JobRow(
                 view,
                 _display_name(job, names),
+                # Until all views are measured, the row has the value over some of their rays.
                 job.psnr if psnr is None else psnr,
                 gaussians if isinstance(gaussians, int) else counts.get(job.id),
                 _thumbnail_address(job, renders.get(job.id)),
@@ -215,6 +217,7 @@ def _stage_rows(job: JobView, spent: dict[str, Any]) -> list[StageRow]:
 def _with_unexpected_stages(expected_stages: Sequence[str], reported: Sequence[str]) -> list[str]:
     """Return the expected stages, with unexpected ones inserted where they occurred."""
     names = list(expected_stages)
+    # Each name with the one that was reported before it.
     for before, name in zip((None, *reported), reported, strict=False):
         if name not in names:
             names.insert(names.index(before) + 1 if before is not None else 0, name)

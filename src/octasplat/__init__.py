@@ -139,6 +139,7 @@ def __getattr__(name: str) -> object:
             f"octasplat.{name} needs '{error.name}', which is not installed; install octasplat, of which "
             "octasplat-client is only the part that talks to a service."
         ) from error
+    # From here on Python finds the name without asking this function.
     globals()[name] = value
     return value
 

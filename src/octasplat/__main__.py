@@ -57,6 +57,7 @@ def view(source: Path, open_page: bool | None, port: int, background: str) -> No
 
     with show_progress() as progress:
         scene = read_scene(source, progress)
+    # SIGTERM unwinds the program here too, so that the temporary file of the scene is removed.
     with exit_on_sigterm():
         try:
             viewer = serve_scene(scene, source, port=port, background=background)

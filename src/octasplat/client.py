@@ -253,6 +253,7 @@ class Job:
                 self._api, self.id, progress or default_progress(), on_note
             )
         except JobFailedError:
+            # Whoever catches the error can ask the job for its state and message.
             self.refresh()
             raise
         return self

@@ -55,6 +55,7 @@ def _log_warning(text: str) -> None:
 
 def in_notebook() -> bool:
     """Return whether a notebook's kernel runs this process."""
+    # Looked up, not imported: where nobody has loaded IPython there is no notebook.
     ipython = sys.modules.get("IPython")
     shell = None if ipython is None else ipython.get_ipython()
     return getattr(shell, "kernel", None) is not None
@@ -68,6 +69,7 @@ class NotebookProgress:
 
     def __init__(self) -> None:
         self._lines: list[str] = []
+        # Only the beginnings and ends of stages; the bar shows what is between them.
         self._stage = EventLines(self._lines.append, interval_seconds=float("inf"))
         self._share: float | None = None
         self._next = 0.0
@@ -83,6 +85,7 @@ class NotebookProgress:
         elif isinstance(event, PhaseFinished):
             self._share = None
         now = time.monotonic()
+        # Ends and warnings are shown at once; of the others there may be hundreds in a second.
         if now >= self._next or isinstance(event, PhaseFinished | Warned):
             self._next = now + UPDATE_INTERVAL_SECONDS
             self._update()

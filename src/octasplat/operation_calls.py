@@ -40,6 +40,7 @@ def names_checked(function: Callable[P, R]) -> Callable[P, R]:
     @functools.wraps(function)
     def call(*values: P.args, **options: P.kwargs) -> R:
         former = [name for name in options if name not in names]
+        # Only the verbs have requests, which know their former names.
         if former and function.__module__ == "octasplat.verbs":
             request = operation(function.__name__.rstrip("_").replace("_", "-")).request
             renamed = replace_former_names((request,), {name: options.pop(name) for name in former})

@@ -51,11 +51,13 @@ def reconstruct_run(
         nonlocal stopped
         listener(event)
         if on_step is not None and isinstance(event, TrainingProgress) and on_step(event) is False:
+            # It ends at the next safe point, where should_stop is asked.
             stopped = True
 
     try:
         run_operation("reconstruct", values, listen, lambda: stopped or should_stop(), threads)
     except CancelledError:
+        # Where on_step has stopped it, the run goes on later and nothing has failed.
         if not stopped:
             raise
     return Run(values["output"])

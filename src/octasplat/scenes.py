@@ -147,6 +147,7 @@ class Scene:
     def sh(self, values: Float[np.ndarray, "n k 3"]) -> None:
         coefficients = np.asarray(values)
         if coefficients.shape == self.gaussians.sh.shape:
+            # In place, as somebody may hold a view of the array.
             self.gaussians.sh[...] = coefficients
         else:  # of another degree
             _check_sh(coefficients, len(self))
@@ -265,6 +266,7 @@ def _opacity_logits(opacities: Float[np.ndarray, "..."]) -> Float64[np.ndarray, 
     values = np.asarray(opacities, np.float64)
     if not ((values >= 0) & (values <= 1)).all():
         raise ConfigError("opacities: must be from 0 to 1.")
+    # The logarithm of 0 is -inf, which the clip makes finite.
     with np.errstate(divide="ignore"):
         return np.clip(np.log(values) - np.log1p(-values), -MAX_LOGIT, MAX_LOGIT)
 

@@ -63,11 +63,13 @@ class GaussianTensors:
 
     def tensors(self) -> list[Tensor]:
         """Return the tensors, as an optimiser takes them; no features where there are none."""
+        # In the order of the fields, which is that of the function's arguments.
         found = (getattr(self, part.name) for part in fields(self))
         return [part for part in found if isinstance(part, Tensor)]
 
     def scene(self) -> Scene:
         """Return the scene with these parameters, copied."""
+        # without the features, which a scene does not hold
         gaussians = _as_flat_gaussians(*(_as_float32(tensor) for tensor in self.tensors()[:5]))
         return Scene(gaussians.copy(), self.facts)
 
@@ -108,6 +110,7 @@ class Rays:
         """Return the rays of a slice, a mask or numbers; of a single number, one ray."""
         if isinstance(which, int):
             which = [which]
+        # An origin that all rays share stays one, whichever of them are chosen.
         shared = len(self.origins) == 1 and len(self) != 1
         origins = self.origins if shared else self.origins[which]
         return Rays(origins, self.directions[which], self.t_min, self.t_max)
@@ -175,9 +178,11 @@ def trace(
     if settings is None:
         settings = TraceSettings(flip_normal_cos=scene.facts.turned_beyond)
     lines = Rays.of(rays) if isinstance(rays, PinholeCamera) else rays
+    # By torch, so that the gradients of directions of any length are right.
     directions = lines.directions / lines.directions.norm(dim=-1, keepdim=True)
     features = given.features
     if features is None:
+        # The function takes a tensor in each place.
         features = given.means.new_zeros((len(given.means), 0))
     found: tuple[Tensor, ...] = _TraceFunction.apply(  # type: ignore[no-untyped-call]
         given.means, given.quats, given.log_scales, given.opacity_logits, given.sh, features,
@@ -186,6 +191,7 @@ def trace(
     rgb, transmittance, depth_sum, depth_median, normal, extra = found
     alpha = 1 - transmittance
     met = alpha > _MIN_ALPHA
+    # The inner choice keeps 0/0 out of the other branch, whose gradient would be NaN for all.
     depth = torch.where(met, depth_sum / torch.where(met, alpha, 1.0), 0.0)
     return TracedRays(rgb, alpha, depth, depth_median, normal, extra)
 
@@ -205,6 +211,7 @@ class _PooledTracer:
 
     def __init__(self, settings: TraceSettings, threads: int) -> None:
         free = _TRACER_POOL.setdefault((settings, threads), deque(maxlen=_MAX_POOLED_TRACERS))
+        # Taking from a deque is atomic, so that threads need no lock.
         try:
             self.tracer = free.pop()
         except IndexError:
@@ -247,13 +254,16 @@ class _TraceFunction(torch.autograd.Function):
         gaussians, rays, lease, hits, features = ctx.state
         tracer = lease.tracer
         gradients = TraceGradients(*(_as_float32(part) for part in given))
+        # One for each argument of forward; the last one is not differentiated.
         out: list[Tensor | None] = [None] * 9
+        # The first six arguments are the Gaussians' parameters, the next two are the rays.
         if any(ctx.needs_input_grad[:6]):
             found = tracer.backward(hits, gradients).numpy()
             rows = (
                 found.means_world, found.quats_wxyz, found.log_scales, found.opacity_logits, found.sh,
                 found.features,
             )  # fmt: skip
+            # Only the Gaussians that were hit have rows; all others have gradients of zero.
             places = torch.from_numpy(found.ids.astype(np.int64))
             for number, part in enumerate(rows):
                 if ctx.needs_input_grad[number]:
@@ -264,6 +274,7 @@ class _TraceFunction(torch.autograd.Function):
             extra = features if features.shape[1] else None
             by_ray = ray_gradients(gaussians, rays, hits, gradients, tracer.settings, extra)
             origins, directions = by_ray.origins_world, by_ray.directions_world
+            # One origin that stands for all rays has the sum of their gradients.
             if len(rays.origins_world) == 1:
                 origins = origins.sum(axis=0, keepdims=True)
             for number, part in ((6, origins), (7, directions)):

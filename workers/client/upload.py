@@ -171,7 +171,7 @@ def _find_or_create_dataset(
     """Return the dataset that was made for just these files, or a new one."""
     digest = hashlib.sha256(f"{holds}\0{name}".encode() if holds == "files" else name.encode())
     for file in files:
-        # In the place of contents, whose digests would take a while to compute before anything is shown.
+        # In the place of the contents, which would all have to be read first.
         facts = file.path.stat()
         digest.update(f"{file.name}\0{facts.st_size}\0{facts.st_mtime_ns}\0{facts.st_ino}\n".encode())
     body = {"name": name, "holds": holds} if holds == "files" else {"name": name}
@@ -218,6 +218,7 @@ def _send_missing(
         try:
             done, _ = wait(jobs, return_when=FIRST_EXCEPTION)
         finally:
+            # What is being sent is sent to its end; what has not begun does not begin.
             pool.shutdown(wait=True, cancel_futures=True)
     for job in done:
         job.result()

@@ -112,6 +112,7 @@ def apply_step(connection: psycopg.Connection, step: Migration) -> None:
     deadline = time.monotonic() + MAX_WAIT_SECONDS
     while True:
         try:
+            # In one transaction, so that exactly the steps that are applied are recorded.
             with connection.transaction():
                 connection.execute(
                     "SELECT set_config('lock_timeout', %s, true)", [f"{LOCK_TIMEOUT_SECONDS:g}s"]

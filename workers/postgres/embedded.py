@@ -203,7 +203,7 @@ class EmbeddedPostgres:
                 f"{self.cluster} holds files but no PG_VERSION, so it is no database that can be started; "
                 "move it away or restore it. Nothing was changed."
             )
-        for left in self.home.glob("cluster.*.partial"):
+        for left in self.home.glob("cluster.*.partial"):  # of starts that were killed
             shutil.rmtree(left)
         partial = self.home / f"cluster.{os.getpid()}.partial"
         partial.mkdir(mode=0o700)

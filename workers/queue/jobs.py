@@ -177,7 +177,7 @@ async def queue_position(connection: Connection, job: Job) -> int | None:
     """Return how many jobs go before a queued job in its queue, if owners take turns; None for any other."""
     if job.state != "queued":
         return None
-    # Each other owner has a turn before each of this owner's jobs, the first only if it queued earlier.
+    # Owners take turns: of each other one as many go before as of this one, one more if it waits longer.
     cursor = await connection.execute(
         """
         WITH waiting AS (

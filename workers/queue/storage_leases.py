@@ -80,6 +80,7 @@ class StorageLease:
             if time.monotonic() > deadline:
                 raise StorageUnavailableError("Contents are being removed from the store; store them again.")
             await asyncio.sleep(_POLL_SECONDS)
+        # Else nothing was marked since before the first byte, and all that was stored is there.
         if removals != self.removals:
             missing = await asyncio.to_thread(_missing_contents, self.storage, contents)
             if missing:
@@ -125,6 +126,7 @@ async def storage_lease(pool: Pool, storage: Storage) -> AsyncIterator[StorageLe
         # Of the version before, removals hold the lock instead of marking what they remove.
         cursor = await connection.execute("SELECT pg_try_advisory_xact_lock_shared(%s) AS quiet", [STORE])
         row = await cursor.fetchone()
+        # None is no count, so that verify() then looks for each content.
         is_quiet = row is not None and row["quiet"] and not await _are_being_removed(connection, None)
         note = StorageLease(new_id(), pool, storage, await _removal_count(connection) if is_quiet else None)
         await connection.execute("INSERT INTO storing (id) VALUES (%s)", [note.id])

@@ -84,6 +84,7 @@ class StoredFrames:
         """
         files = list(files)
         fetched = self.fetched(files)
+        # No frame stays in the store: all files are fetched.
         if len(fetched) == len(files):
             return files
         self.add(files)

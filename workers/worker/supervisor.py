@@ -83,6 +83,7 @@ class Supervisor:
         self._workspace = Workspace(context.settings.work_folder, attempt.job, context.storage)
         others = (Path(context.settings.storage_address), context.settings.data)
         places = PathRedactor(self._workspace.folder, context.settings.work_folder, others)
+        # All that the attempt writes for users is rid of the paths of this machine.
         self._attempt = attempt = replace(
             attempt, redact=lambda value: redact_json(value, places), quota=context.quota
         )

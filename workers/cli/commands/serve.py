@@ -56,6 +56,7 @@ def serve(
     def say(address: str) -> None:
         click.echo(f"octasplat serves at {address}  (Ctrl-C stops it; octasplat open signs a browser in)")
         if (has_display() if open_page is None else open_page) and not demo:
+            # In a thread, as it waits until the browser has read the link.
             threading.Thread(target=show_page, daemon=True).start()
 
     async def show(address: str) -> None:

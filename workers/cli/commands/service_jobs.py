@@ -178,6 +178,7 @@ def logs(job_id: str, follow: bool, as_json: bool, server: str | None) -> None:
         job = find_job(api, job_id)
         after = 0
         while True:
+            # Before the lines are read, so that the last ones are among them.
             over = job["state"] in ("succeeded", "failed", "canceled")
             page = api.get(f"/v1/jobs/{job['id']}/logs", after=after)
             for line in page["lines"]:

@@ -226,6 +226,7 @@ def _as_dataset(api: "Api", scene: Path | str) -> Path | str:
             f"{scene}: photographs are sent, not videos; octasplat reconstruct takes a video and writes the "
             "frames that it chooses beside its results."
         )
+    # Eight hexadecimal digits may be the name of a folder as well.
     is_short = re.fullmatch(f"[0-9a-f]{{{SHOWN_CHARACTERS}}}", str(scene)) and not scene.exists()
     return Path(find_dataset(api, str(scene))["id"]) if is_short else scene
 
@@ -263,6 +264,7 @@ def _with_assignments(options: dict[str, Any], assignments: tuple[str, ...]) -> 
         name, equals, text = assignment.partition("=")
         if not equals:
             raise ConfigError(f"--set {assignment}: write it as name=value, e.g. q=9.")
+        # What is no JSON is text, so that words need no quotes in a shell.
         try:
             value = json.loads(text)
         except ValueError:

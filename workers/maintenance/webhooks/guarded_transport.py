@@ -77,6 +77,7 @@ class GuardedTransport(httpx.AsyncBaseTransport):
             found = await asyncio.wrap_future(self._look_up(host, port, owner))
         except (OSError, UnicodeError) as error:
             raise httpx.ConnectError("The host has no address.") from error
+        # Several entries of a lookup may have the same address.
         addresses = list(dict.fromkeys(parse_address(str(sockaddr[0])) for *_, sockaddr in found))
         if not is_allowed(host, self._allowed_hosts) and not all(map(is_public, addresses)):
             raise AddressRefusedError("The address leads into a network that messages are not sent to.")
