@@ -35,4 +35,4 @@ def light_up(source: Path, name: str | None) -> "Float64[np.ndarray, '3']":
 
     if name is None and is_run(source) and (source / CONFIG).exists():
         return np.array(read_config(source / CONFIG).train.materials.up_world, np.float64)
-    return axis_named(name or "-y")
+    return axis_named(name or "-y")  # up in most worlds that COLMAP makes

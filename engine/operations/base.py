@@ -27,6 +27,7 @@ class Options(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _by_new_names(cls, given: Any) -> Any:
+        # jobs and scripts may have former names
         return renamed_settings.replace_former_names((cls,), given) if isinstance(given, Mapping) else given
 
 
@@ -188,6 +189,7 @@ def stop_if(should_stop: Callable[[], bool]) -> None:
 
 def options_of(model: type[OptionsT], request: Options) -> OptionsT:
     """Return the options that a request has, whose class inherits from theirs."""
+    # validated already, as the request was
     options = model.model_construct(**{name: getattr(request, name) for name in model.model_fields})
     assert isinstance(options, model)
     return options
@@ -216,7 +218,7 @@ def build_request(
     try:
         return model.model_validate({name: value for name, value in values.items() if value is not None})
     except ValidationError as error:
-        of_all = not error.errors()[0]["loc"]
+        of_all = not error.errors()[0]["loc"]  # a complaint without a place is about the whole request
         raise (ContradictoryRequestError if of_all else ConfigError)(first_error(error, place)) from None
 
 

@@ -91,7 +91,7 @@ def run(
     if request.output is not None:
         scene_io.check_edited_output("clean", request, request.output)
     gaussians = scene_io.open_scene(source, progress)
-    share = request.camera_clearance
+    share = request.camera_clearance  # a file has neither cameras nor sparse points
     zones = run_camera_clearance(source, share) if share > 0 and is_run(source) else None
     seen = run_seen_test(source, request.min_views) if request.min_views > 0 and is_run(source) else None
     keep, report = clean(gaussians, request, zones, seen)
@@ -108,7 +108,7 @@ def run(
         )
     counts = {"count": len(gaussians), **report.model_dump()}
     if request.output is None:
-        return CleanResult(notes=(message,), **counts)
+        return CleanResult(notes=(message,), **counts)  # all but the file's writing is done, as in a real run
     stop_if(should_stop)
     record = scene_io.describe_edit("clean", options_of(CleanOptions, request), gaussians=report.kept)
     written = scene_io.write_edited_scene(

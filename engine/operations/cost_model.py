@@ -144,7 +144,7 @@ def estimate_reconstruction(
     iterations = iteration_count(train, trained_on)
     gaussians = _expected_gaussians(train, trained_on)
     training_cpu_seconds = iterations * train.rays_per_batch * _ray_cpu_seconds(train, gaussians)
-    if options.minutes is not None:
+    if options.minutes is not None:  # the time is given: it is used up
         training_cpu_seconds = 60 * options.minutes * max(1, cores) ** _CORE_POWER
     materials = train.materials.learn
     each_pixel = _MATERIAL_EVALUATE_CPU_SECONDS_PER_PIXEL if materials else _EVALUATE_CPU_SECONDS_PER_PIXEL
@@ -164,13 +164,14 @@ def estimate_reconstruction(
         train.rays_per_batch, train.probe_rays
     )
     if materials:
+        # the largest of both phases: they follow each other
         training = max(training + _MATERIAL_TRAIN_BYTES, _MATERIAL_START_BYTES)
     memory = _START_BYTES + max(training, _PIXEL_BYTES * largest)
     disk = reconstruction_bytes(options, photographs)
     found = _make_estimate(
         cpu_seconds, memory, cores, finds_poses=finds_poses, disk_bytes=disk, stages=stages
     )
-    share = sum(search.values()) / cpu_seconds
+    share = sum(search.values()) / cpu_seconds  # of the clock's time, which several cores shorten
     return found.model_copy(update={"poses_seconds": round(share * found.seconds, 1)})
 
 
@@ -254,6 +255,7 @@ def rendered_pixels(options: PictureOptions, photographs: Sequence[ImageSizes]) 
         return (1 if is_preview else path.frame_count) * path.width * path.height
     if options.mode != "views":
         return (1 if is_preview else options.frame_count) * options.width_px * options.height_px
+    # which sizes the named photographs have is not known here: the largest
     shrunk = [_capped_sizes(sizes, options.max_side) for sizes in photographs]
     if options.photographs is not None:
         largest = max((sizes.width_px * sizes.height_px for sizes in shrunk), default=0)
@@ -320,7 +322,7 @@ def _gaussian_bytes(sh_degree: int) -> int:
     """Return the bytes per Gaussian: float32 parameters, gradients, two moments and mean, and hierarchy.
 
     789 for degree 2 were measured before there was that mean, which adds 148.
-    """
+    """  # bytes: float32 parameters, gradients, two moments and mean are 20 a number
     return 197 + 20 * (10 + 3 * (sh_degree + 1) ** 2)
 
 

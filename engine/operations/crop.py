@@ -71,6 +71,7 @@ def run(
     gaussians, origin = scene_io.open_scene(source, progress), read_metadata(source).origin_world
     keep = selection_mask(gaussians, request, origin)
     if not keep.any():
+        # the message helps to choose a box: positions in the user's coordinates
         means = gaussians.means_world
         corners = [user_position(corner, origin) for corner in (means.min(axis=0), means.max(axis=0))]
         bounds = " to ".join(corners)

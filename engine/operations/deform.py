@@ -110,6 +110,7 @@ def run(
     frames = SceneSequence("deform", request, paths, [request.proxy])
     gaussians, origin = open_scene(source, progress), read_metadata(source).origin_world
     rest = read_mesh(request.proxy).about(origin)
+    # Gaussians follow the corners of their octagons
     corners = deformation_corners(gaussians)
     binding = _bind_scene(request, _make_proxy(request, rest), corners)
     moving, count = int(binding.moving_mask.sum()), len(gaussians)
@@ -181,6 +182,7 @@ def _has_same_faces(one: ImportedMesh, other: ImportedMesh) -> bool:
         return False
     if np.array_equal(one.triangles, other.triangles):
         return True
+    # the same vertices in any order, so that flipped triangles count as the same
     first, second = (np.sort(mesh.triangles, axis=1) for mesh in (one, other))
     return np.array_equal(first[np.lexsort(first.T)], second[np.lexsort(second.T)])
 

@@ -94,6 +94,7 @@ def run(
     config, cores = request.config(), request.cores or threads
     if is_video(request.source):
         frames = planned_frames(request.source, request.frames_per_second)
+        # a video has no model: poses are found
         estimate = estimate_photographs([frames], config.with_poses_decided(False), cores)
         return EstimateResult(photographs=(frames,), **estimate.model_dump())
     scene = locate_scene(request.source)

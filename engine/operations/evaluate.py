@@ -22,7 +22,7 @@ def _read_scales(value: object) -> object:
         return value
     try:
         numbers = sorted({int(part) for part in parts})
-    except (TypeError, ValueError):
+    except (TypeError, ValueError):  # refused below, with the sentence about scales
         numbers = [0]
     if numbers and numbers[0] < 1:
         raise ValueError("scales are whole numbers from 1 on, such as 2,4,8")
@@ -162,6 +162,7 @@ def run(
         return _measure_scales(request, listener, threads)
     on, dataset = request.other_dataset, request.dataset
     if request.all_views and on is None:
+        # the run's own photographs, but all of them, as if of another dataset
         on, dataset = photographs_folder(request.source, dataset), None
     metrics = run_evaluation.evaluate(
         request.source,

@@ -190,6 +190,7 @@ def run(
     from octasplat.engine.operations.scene_io import check_scenes, open_scene
     from octasplat.engine.operations.written_files import remember_written
 
+    # refused before the scene is read, which may take long
     check_scenes(
         "export", request.files, [request.source], overwrite=request.overwrite, format=request.format
     )
@@ -199,7 +200,7 @@ def run(
         progress(Warned(message))
     count = len(request.files)
     gaussians = open_scene(request.source, progress)
-    if request.materials:
+    if request.materials:  # materials are what is asked for: what is lost of the harmonics does not matter
         require_materials(gaussians, request.source)
     else:
         for text in dropped_on_export(
@@ -248,6 +249,7 @@ class _ExportPreparation:
             return self._gaussians, options.model_copy(
                 update={"surface": self._surface, "turn_xyzw": upright_turn(request.source)}
             )
+        # formats of one color a Gaussian get the color that loses least
         if not (exporter.holds_harmonics or (request.materials and is_glb)):
             gaussians = self._baked_color
         else:

@@ -18,7 +18,7 @@ def expand_patterns(given: Sequence[Path]) -> tuple[Path, ...]:
     """
     paths: list[Path] = []
     for path in given:
-        if path.exists() or not glob.has_magic(str(path)):
+        if path.exists() or not glob.has_magic(str(path)):  # an existing name wins, though it has brackets
             paths.append(path)
             continue
         matches = sorted(glob.glob(str(path), recursive=True), key=_natural_sort_key)  # noqa: PTH207 (may be absolute)
@@ -31,5 +31,8 @@ def expand_patterns(given: Sequence[Path]) -> tuple[Path, ...]:
 def _natural_sort_key(name: str) -> list[tuple[int, int, str]]:
     """Return a sort key in which 10 comes after 9."""
     return [
-        (0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", name) if part
+        # numbers sort before texts, so that parts of both kinds compare
+        (0, int(part), "") if part.isdigit() else (1, 0, part)
+        for part in re.split(r"(\d+)", name)
+        if part
     ]

@@ -125,6 +125,7 @@ def run(
     report_dropped_on_import(source, report, progress)
     degree = request.sh_degree
     if degree is not None and degree < gaussians.sh_degree:
+        # a copy, so that the longer array is freed
         gaussians.sh = gaussians.sh[:, : (degree + 1) ** 2].copy()
     stop_if(should_stop)
     write_gaussian_ply(gaussians, request.output, facts=read_metadata(source))

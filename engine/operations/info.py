@@ -80,6 +80,7 @@ class InfoResult(Result):
     def facts(self) -> dict[str, Any]:
         """Return everything but the picture, as JSON values."""
         scene = asdict(self.scene)
+        # numpy arrays are no JSON
         scene["seen"] = {
             name: value.tolist() if hasattr(value, "tolist") else value
             for name, value in scene["seen"].items()

@@ -86,6 +86,7 @@ def run(
     check_edited_output("material", request, output, [request.mesh, *request.masks])
     gaussians, origin = open_scene(source, progress), read_metadata(source).origin_world
     require_materials(gaussians, source / SCENE if is_run(source) else source)
+    # the choice is inverted below, once mesh and masks have their part in it
     chosen = selection_mask(gaussians, request.model_copy(update={"inverse": False}), origin)
     if request.mesh is not None:
         chosen &= in_mesh(gaussians, read_mesh(request.mesh).about(origin), request.mesh)

@@ -83,7 +83,9 @@ def run(
     sources = (first, *request.scenes)
     check_edited_output("merge", request, request.output, request.scenes)
     facts = [read_metadata(source) for source in sources]
+    # all about the first scene's origin, in which the result is written
     scenes = [open_scene_about(source, facts[0].origin_world, progress) for source in sources]
+    # a dict keeps the order in which channels come
     every = dict.fromkeys(name for scene in scenes for name in scene.channels)
     for source, scene in zip(sources, scenes, strict=True):
         if missing := ", ".join(name for name in every if name not in scene.channels):

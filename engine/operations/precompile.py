@@ -106,7 +106,7 @@ def start_compiling(groups: Sequence[str], processes: int = 1) -> list[subproces
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            env={**os.environ, "OMP_NUM_THREADS": "1"},
+            env={**os.environ, "OMP_NUM_THREADS": "1"},  # kernels get no threads of BLAS beside them
         )
         for number in range(processes)
     ]
@@ -136,6 +136,7 @@ def _ended(processes: list[subprocess.Popen[bytes]]) -> Iterator[list[subprocess
     try:
         yield processes
     finally:
+        # killed at once: what is compiled is kept, and nothing else is written
         for process in processes:
             process.kill()
         for process in processes:

@@ -221,6 +221,7 @@ def run_config(request: ReconstructRequest) -> "ReconstructionConfig":
     """
     from octasplat.engine.runs.config import read_config
 
+    # with options the request's configuration counts, and is checked against the run's
     given = request.model_fields_set - {"source", "output", "resume", "exports", "frames_per_second"}
     given -= {name for name in ("train", "assignments") if not getattr(request, name)}
     if not request.resume or given or not (request.output / _CONFIG).exists():
@@ -283,7 +284,7 @@ def run(
     config = run_config(request)
     output = request.output
     scene = scene_folder(request)
-    if scene != request.source:
+    if scene != request.source:  # the source is a video
         _take_frames(request, scene, stop_when_asked(progress, should_stop))
     reconstruct(
         locate_scene(scene),

@@ -43,6 +43,7 @@ def operation(name: str) -> Operation[Any, Any]:
     """
     if name not in _MODULES:
         raise ConfigError(f"There is no operation '{name}'; choose one of {', '.join(_MODULES)}.")
+    # imported when it is asked for: a command loads no other verb's modules
     found: Operation[Any, Any] = import_module(f"octasplat.engine.operations.{_MODULES[name]}").OPERATION
     return found
 

@@ -90,6 +90,7 @@ class RelightOptions(PictureOptions):
     def unused(self) -> tuple[str, ...]:
         """Return a sentence about given options that have no effect on such images."""
         sentences = super().unused()
+        # a square grid of rays
         if self.integrator == "split-sum" and self.rays_across**2 != self.samples_per_pixel:
             sentences += (
                 f"Of {self.samples_per_pixel} samples split-sum takes {self.rays_across**2}, as many across "
@@ -183,6 +184,7 @@ def run(
         "relight", request, tuple(lightings), [request.other_dataset, *request.environments]
     )
     background = request.background or source.background
+    # before the relighter is made, which takes long
     finished = output.finished_images(
         render_digest(
             "relight",
@@ -248,7 +250,9 @@ def _make_relighter(
             rays_across_pixel=request.rays_across, threads=threads,
         )  # fmt: skip
     integrator = Integrator(
-        samples=request.samples_per_pixel, max_depth=request.max_bounces, roulette_depth=request.max_bounces
+        samples=request.samples_per_pixel,
+        max_depth=request.max_bounces,
+        roulette_depth=request.max_bounces,
     )
     return PathRelighter(source.gaussians, source.settings, integrator, threads=threads)
 

@@ -129,10 +129,12 @@ class RenderRequest(RenderOptions, PictureRequest):
             return values
         given = dict(values)
         if given.get("stage_file") is not None and given.get("stage") is None:
+            # the stage's files are named relative to its own file
             given["stage"] = read_stage(Path(given["stage_file"]))
             given["stage_folder"] = Path(given["stage_file"]).parent
         stage = given.get("stage")
         layers = given.get("layers") or (isinstance(stage, Stage) and stage.integrator.layers)
+        # layers need EXR, which the output's name may not say
         if layers and stage is not None and "output" in given and given.get("format") is None:
             check_layers(Path(given["output"]))
             given["format"] = "exr"
@@ -201,6 +203,7 @@ def run(
     report = stop_when_asked(progress, should_stop, message)
     for unused in request.unused():
         report(Warned(unused))
+    # a preview is small by default
     max_side = request.max_side or (PREVIEW_SIDE_PX if request.preview else None)
     source = read_render_source(
         request.source,
@@ -208,6 +211,7 @@ def run(
         dataset=request.dataset,
         max_side=max_side,
         full_size=request.stage is not None,
+        # a stage says itself how Gaussians are lit
         shading=request.shading if request.stage is None else "harmonics",
     )
     cameras = requested_cameras(request, source)
@@ -234,6 +238,7 @@ def _render_plain(plan: _RenderPlan, progress: EventListener, threads: int) -> t
     from octasplat.engine.shading.plain import PLAIN_SHADING
     from octasplat.engine.trace.factory import make_tracer
 
+    # transparent pictures are rendered over black, and alpha is kept
     transparent = request.background == "transparent"
     background = background_color("black" if transparent else request.background or source.background)
     learnt = None if request.background else source.learnt  # another color was asked for, or alpha
@@ -278,6 +283,7 @@ def _render_on_stage(plan: _RenderPlan, progress: EventListener, threads: int) -
         compile_stage(stage, scene, shots).preview(shots[0], request.output, progress)
         return (request.output,)
     views = None if cameras is not None else (source.viewpoints, source.near_world)
+    # what decides how images look; the output's place does not
     finished = output.finished_images(
         render_digest(
             source.gaussians, source.settings, background, False, cameras,

@@ -185,6 +185,7 @@ def requested_cameras(request: PictureRequest, source: RenderSource) -> tuple[Pi
     """
     if request.mode == "views":
         return None
+    # path files are in the user's coordinates, or about the local origin already
     if request.camera_path is not None:
         given = path_cameras(request.camera_path, str(request.path_file or "of the options")).cameras
         found = _about_origin(given, source.origin_world)
@@ -212,6 +213,7 @@ def requested_cameras(request: PictureRequest, source: RenderSource) -> tuple[Pi
 def _about_origin(cameras: tuple[PinholeCamera, ...], origin: Origin) -> tuple[PinholeCamera, ...]:
     """Return cameras of a path about the scene's origin; a path drawn on exported files is so already."""
     centres = np.stack([camera.world_from_cam[:3, 3] for camera in cameras])
+    # far from the local origin the file's positions are whole
     shifted = vertices_about(centres, origin) - centres
     if not shifted.any():
         return cameras

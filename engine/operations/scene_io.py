@@ -60,6 +60,7 @@ def open_scene_about(path: Path, origin_world: Origin, progress: EventListener) 
     """
     scene, own = open_scene(path, progress), read_metadata(path).origin_world
     moved = about_origin(scene, own, origin_world)
+    # rounding of float32 at the farthest mean
     step = float(np.spacing(np.abs(moved.means_world).max(initial=0.0)))
     sizes = float(np.median(scene.scales)) if len(scene) else 0.0
     if own != origin_world and step > MAX_ROUNDING * sizes:
@@ -84,7 +85,7 @@ def report_dropped_on_import(path: Path, report: ImportReport, progress: EventLi
             f"{path}: {report.flattened:,} of {report.count:,} Gaussians were not flat and lost their "
             f"smallest extent, which was {report.median_thickness:.2g} of the next one in the median"
         )
-        if 2 * report.thick > report.flattened:
+        if 2 * report.thick > report.flattened:  # more than half: the scene consists of thick Gaussians
             progress(Warned(f"{loss}; as flat Gaussians the scene will look different."))
         else:
             progress(Noted(f"{loss}."))
@@ -116,6 +117,7 @@ def check_scenes(
         OutputError: one of them is there and not by the verb.
         SceneFileError: no format takes a name.
     """
+    # some formats write a second file
     beside = [path for output in outputs for path in exporter_for(output, format).beside(output)]
     check_targets(verb, [*outputs, *beside, *others], inputs, overwrite=overwrite)
 
@@ -234,6 +236,7 @@ def describe_edit(name: str, options: BaseModel, **counts: int) -> dict[str, obj
         options: what was asked for.
         counts: numbers of Gaussians that it changed.
     """
+    # names only: the folders of a machine say nothing elsewhere
     requested = map_named_files(options, lambda path: Path(path.name))
     recorded = type(options).model_construct(**requested).model_dump(mode="json", exclude_defaults=True)
     return {"operation": name, **recorded, **counts}

@@ -25,6 +25,7 @@ def targets_for(output: Path, sources: Sequence[Path]) -> tuple[Path, ...]:
         ConfigError: two targets are the same.
     """
     if "%" in output.name:
+        # a pattern: numbered even for one source
         try:
             targets = [output.with_name(output.name % number) for number in range(len(sources))]
         except (TypeError, ValueError):
@@ -36,6 +37,7 @@ def targets_for(output: Path, sources: Sequence[Path]) -> tuple[Path, ...]:
             output.with_name(f"{output.stem}_{number:04d}{output.suffix}") for number in range(len(sources))
         ]
     else:
+        # names differ by more than case, for file systems that ignore it
         uses = Counter(source.stem.casefold() for source in sources)
         targets = [
             output / (f"{stem}_{number:04d}.ply" if uses[stem.casefold()] > 1 else f"{stem}.ply")
@@ -79,6 +81,7 @@ class SceneSequence:
             check_targets(verb, reports, reads, overwrite=request.overwrite)
         else:
             self._targets = targets_for(output, meshes)
+            # resolved, so that two spellings of one path are noticed
             if {path.resolve() for path in reports} & {target.resolve() for target in self._targets}:
                 raise ConfigError(
                     f"{request.report}: would overwrite a result; choose another name for the report."
@@ -99,6 +102,7 @@ class SceneSequence:
             self.files, self.folder = written.files, written.folder
             return written.sentence
         self.files = (*self.files, target)
+        # the losses are the same for each frame
         return write_scene(gaussians, read_metadata(self._source), target, progress, warn=number == 0)
 
     def report(self, number: int, progress: EventListener) -> None:

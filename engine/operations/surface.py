@@ -113,11 +113,12 @@ class SurfaceOptions(ExtractionOptions, Options):
         given = renamed_settings.replace_former_names((cls,), given)
         room = ROOM_DEFAULTS if _is_on(given.get("room", False)) else {}
         materials = MATERIAL_DEFAULTS if _is_on(given.get("materials", False)) else {}
-        return {**room, **materials, **given}
+        return {**room, **materials, **given}  # what is given wins over both presets
 
     @field_validator("up")
     @classmethod
     def _check_up(cls, up: Axis | None, info: Any) -> Axis | None:
+        # unknown where materials is refused itself
         if up is not None and info.data.get("materials") is False:
             raise ValueError("goes with materials, and there are none")
         return up
@@ -267,6 +268,7 @@ def run(
     surfaces = extract_levels(
         tracer,
         cameras,
+        # bounds are given in the user's coordinates
         request.model_copy(update={"bounds": box_about(request.bounds, origin)}),
         tuple(request.levels.values()) or (None,),
         scratch=output.parent,
@@ -322,6 +324,7 @@ def _light_to_copy(source: Path, output: Path) -> Path | None:
         return None
     if not place.exists():
         return light
+    # the same environment needs no copy
     if place.samefile(light) or place.read_bytes() == light.read_bytes():
         return None
     raise OutputError(

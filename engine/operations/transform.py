@@ -74,6 +74,7 @@ class TransformOptions(Options):
             turns = affine.scaling(np.full(3, self.scale)) @ turns
         for axis, degrees in self.rotate:
             turns = affine.rotation(affine.AXES[axis], degrees) @ turns
+        # about the point: moved to the origin, turned, moved back
         combined = affine.conjugate_by_point(turns, np.array(self.about))
         if self.matrix is not None:
             combined = combined @ affine.read_matrix(self.matrix)
@@ -138,6 +139,7 @@ def run(
             **scene_io.describe_edit("transform", options_of(TransformOptions, request)),
             "world_map": rows,
         },
+        # distances scale with the world, the origin is that after the map
         facts=replace(facts.scaled(mean_scale(matrix)), origin_world=origin),
         matrix=local,
     )

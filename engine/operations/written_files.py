@@ -55,7 +55,7 @@ def check_targets(
         ConfigError: one of them is read.
         OutputError: one of them is there and somebody else's.
     """
-    checked = tuple(dict.fromkeys(targets))
+    checked = tuple(dict.fromkeys(targets))  # each once, in order
     read = _Read([path for path in inputs if path is not None])
     for target in checked:
         if target.is_dir():
@@ -78,9 +78,10 @@ def remember_written(verb: str, files: Iterable[Path]) -> None:
     """Record files that a verb has written, which it may replace later."""
     rows = []
     for file in files if verb != _FOR_EDITS else ():
-        with suppress(OSError):
+        with suppress(OSError):  # a file that is gone is not remembered
             stat = file.stat()
             rows.append((str(file.resolve()), _kind_of_verb(verb), stat.st_size, stat.st_mtime_ns))
+    # The record is a convenience: where it cannot be kept, --overwrite is needed once more.
     with suppress(OSError, sqlite3.Error), _open_database() as database, database:
         database.executemany("INSERT OR REPLACE INTO written VALUES (?, ?, ?, ?)", rows)
 
@@ -107,6 +108,7 @@ class _Read:
         if place in self._files:
             return self._files[place]
         for folder in self._folders:
+            # a run inside of a folder that is read is no part of that input
             parents = place.parents[: len(place.parts) - len(folder.parts)]
             if place.is_relative_to(folder) and not any(map(is_run_folder, parents[:-1])):
                 return f" in {folder}"
@@ -134,6 +136,7 @@ def _kind_of_verb(verb: str) -> str:
 
 def _is_ours(file: Path, known: _UNCHANGED_SINCE) -> bool:
     stat = file.stat()
+    # size and time are enough: nobody changes a file and keeps both by accident
     return known.get(str(file.resolve())) == (stat.st_size, stat.st_mtime_ns)
 
 
@@ -153,6 +156,7 @@ def _open_database() -> Iterator[sqlite3.Connection]:
     named = os.environ.get(RECORD_VARIABLE)
     path = Path(named) if named else platformdirs.user_state_path("octasplat") / "written.sqlite"
     path.parent.mkdir(parents=True, exist_ok=True)
+    # other processes may hold the lock for a moment
     with closing(sqlite3.connect(path, timeout=10)) as database:
         database.execute(_TABLE)
         yield database

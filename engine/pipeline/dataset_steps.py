@@ -57,7 +57,7 @@ class OpenDataset:
         """Open the photographs, and record which they are."""
         output = run.output
         run.dataset = _load_dataset(run)
-        if run.recorded is None:
+        if run.recorded is None:  # a run that goes on keeps the poses that it has trained with
             _repair_poses(run)
             write_views(output / VIEWS, run.dataset.views_record)
         held_out = [run.dataset.views[i].name for i in run.dataset.test_indices]

@@ -78,6 +78,7 @@ def release_on_refusal(output: Path, *, is_new: bool, is_made: bool) -> Iterator
 def _is_unclaimed(output: Path, finds_poses: bool) -> bool:
     """Return whether a folder is empty, or holds only the remains of a refused start."""
     for path in output.iterdir():
+        # caches of a refused start are taken over
         if path.name == CACHE and path.is_dir():
             if not all(file.suffix in (".bin", ".json") for file in path.iterdir()):
                 return False

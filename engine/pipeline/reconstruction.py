@@ -65,6 +65,7 @@ def reconstruct(
     if not (output / SCENE).exists():
         check_writable(config.exports)
     use_threads(threads)
+    # before the claim, which makes the folder
     is_made, is_new = not output.exists(), claim_output(scene, output, config, resume)
     with lock_run_folder(output):
         _run_all_steps(
@@ -87,6 +88,7 @@ def _run_all_steps(run: ReconstructionRun, *, is_new: bool, is_made: bool) -> No
     """Execute all steps of a run whose folder is claimed."""
     began, output = time.perf_counter(), run.output
     recorded = read_views(output / VIEWS) if (output / VIEWS).exists() else None
+    # held back until the photographs are known to be the same
     events = JsonLinesWriter(output / EVENTS, hold=recorded is not None)
     report = broadcast([events, run.progress])
     run.progress, run.recorded = report, recorded

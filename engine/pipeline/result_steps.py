@@ -49,6 +49,7 @@ class ExportStep:
             ExportError: some could not be written.
         """
         with phase("export", run.progress, len(run.config.exports)):
+            # a resumed run writes only what is not there
             missing = [name for name in run.config.exports if not (run.output / name).exists()]
             failed = _export(run, missing) if missing else None
         if failed is not None:

@@ -88,6 +88,6 @@ def run_steps(steps: Sequence[Step], run: ReconstructionRun) -> None:
             raise
         except Exception:
             if not step.is_needed_later:
-                with suppress(ExportError):
+                with suppress(ExportError):  # the first failure is told, not that of a later step
                     run_steps(steps[place + 1 :], run)
             raise

@@ -21,12 +21,12 @@ def lock_run_folder(output: Path) -> Iterator[None]:
     Raises:
         OutputError: another process works there.
     """
-    folder = os.open(output, os.O_RDONLY | os.O_DIRECTORY)
+    folder = os.open(output, os.O_RDONLY | os.O_DIRECTORY)  # the folder itself: no lock file is left behind
     try:
         try:
             fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            if error.errno in _LOCKED_MESSAGE:
+            if error.errno in _LOCKED_MESSAGE:  # any other error: a file system without locks
                 raise OutputError(
                     f"Another octasplat works on the run in {output}; wait for it or stop it, or name "
                     "another folder."

@@ -112,13 +112,13 @@ def _make_trainer(
     fingerprint = run_fingerprint(dataset, config)
     state = load_latest_checkpoint(folder, fingerprint, progress)
     if state is None:
-        _warn_of_useless_materials(run, config)
+        _warn_of_useless_materials(run, config)  # before the first Gaussians, which take long
         state = initial_train_state(dataset, config, threads=use_threads(run.threads))
         if exposure_changes is not None:
             progress(Warned(f"{exposure_changes} That is learnt; exposure=false leaves it out."))
-        state.seconds = clock.seconds()
+        state.seconds = clock.seconds()  # the clock of the phase, the making of the first Gaussians included
     else:
-        clock.add(state.seconds)
+        clock.add(state.seconds)  # time of earlier processes counts
     zones = CameraClearance.from_views(
         dataset.viewpoints, config.camera_clearance * nearest_world, dataset.train_indices
     )
@@ -242,4 +242,5 @@ def _plan_settings(
         left = 60 * settings.minutes - 2 * clock.seconds()  # the first Gaussians are made once more
         plan = make_plan(dataset, config, first, seconds=left, threads=threads, should_stop=should_stop)
         write_plan(output / PLAN, plan)
+    # read back, so that a run that goes on has the very same numbers
     return read_plan(output / PLAN).apply_to(config)

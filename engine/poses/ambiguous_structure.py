@@ -70,7 +70,7 @@ def find_false_pairs(votes: PairInliers) -> Int64[np.ndarray, "f 2"]:
     minus outliers, and is refined by moving single photographs.
     """
     numbers, index = np.unique(votes.pairs, return_inverse=True)
-    if len(numbers) < 3:
+    if len(numbers) < 3:  # two photographs cannot be parted into two groups that see different places
         return votes.pairs[:0]
     a, b = index.reshape(-1, 2).T
     weight = np.zeros((len(numbers), len(numbers)))
@@ -99,10 +99,12 @@ def remove_pairs(database: Path, pairs: Int64[np.ndarray, "f 2"]) -> None:
 
 def _min_cut(weight: Float64[np.ndarray, "n n"]) -> Bool[np.ndarray, " n"]:
     """Return the sides of a cut with a small sum of weights across it."""
+    # the Fiedler vector's analog for signed weights
     _, vectors = np.linalg.eigh(np.diag(weight.sum(axis=1)) - weight)
     order = np.argsort(vectors[:, 0], kind="stable")
     side = np.zeros(len(weight), dtype=bool)
     best, cut = side.copy(), np.inf
+    # the best cut along its order, then single moves
     for photograph in order[:-1]:
         side[photograph] = True
         across = float(weight[side][:, ~side].sum())
@@ -130,9 +132,10 @@ def _refine_cut(
     for _ in range(len(sign)):
         photograph = int(np.argmax(np.where(open_, -sign * pull, -np.inf)))
         sign[photograph] = -sign[photograph]
+        # only the moved photograph's edges have changed
         pull += 2 * sign[photograph] * weight[:, photograph]
         open_[photograph] = False
-        across = float(total - sign @ pull) / 4
-        if across < least and abs(sign.sum()) < len(sign):
+        across = float(total - sign @ pull) / 4  # cut = (sum of all weights - sum of signed ones) / 4
+        if across < least and abs(sign.sum()) < len(sign):  # both sides have photographs
             best, least = sign > 0, across
     return best, least

@@ -92,7 +92,7 @@ def extract_features(
     options.max_image_size = MAX_IMAGE_SIDE_PX
     options.use_gpu = False
     options.sift.max_num_features = MAX_FEATURES * (2 if thorough else 1)
-    if thorough:
+    if thorough:  # fainter features, too
         options.sift.peak_threshold /= 3
     with pycolmap.Database.open(database) as found:
         missing = [
@@ -152,6 +152,7 @@ def match_pairs(
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = config.seed
     with pycolmap.Database.open(database) as found:
+        # a search that was stopped has some already
         wanted = [(a, b) for a, b in pairs if not found.exists_two_view_geometry(a + 1, b + 1)]
     done = len(pairs) - len(wanted)
     if done:
@@ -181,6 +182,7 @@ def preselect_pairs(
     options.num_threads = threads
     options.use_gpu = False
     options.skip_geometric_verification = True
+    # the quick look needs no geometry, only counts
     verification = pycolmap.TwoViewGeometryOptions()
     verification.min_num_inliers = _MIN_PRESELECTION_PHOTOGRAPHS
     alike: dict[Pair, int] = {}

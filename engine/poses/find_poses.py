@@ -94,7 +94,7 @@ def find_poses(
         _ColmapProcess(request, progress, should_stop).wait()
         record = read_pose_record(work / FOUND_FOLDER)
         write_json(work / FOUND_FOLDER / RECORD_FILE, {**record, "photographs_sha256": sha256})
-        (work / FOUND_FOLDER).rename(output)
+        (work / FOUND_FOLDER).rename(output)  # in one step: the folder is whole or is not there
 
 
 def repair_poses(
@@ -192,7 +192,7 @@ def adjust_principal_points(
         facts: dict[str, float] | None = read_pose_record(work / FOUND_FOLDER)["lenses"]
         if facts is not None:
             write_json(work / FOUND_FOLDER / RECORD_FILE, {**before, "lenses": facts})
-            if output.is_dir():
+            if output.is_dir():  # the former model moves into the folder for the work, which is removed
                 output.rename(work / "before")
             (work / FOUND_FOLDER).rename(output)
     return facts
@@ -315,10 +315,8 @@ class _ColmapProcess:
 @contextmanager
 def _start_process(request: PoseSearchRequest, stderr_log: IO[bytes]) -> Iterator["subprocess.Popen[bytes]"]:
     """Start the process in the caller's process group; it is killed when the block ends."""
-    environment = {
-        **os.environ,
-        **dict.fromkeys(_SINGLE_THREAD_VARIABLES, "1"),
-    }  # COLMAP has threads of its own
+    # COLMAP has threads of its own.
+    environment = {**os.environ, **dict.fromkeys(_SINGLE_THREAD_VARIABLES, "1")}
     process = subprocess.Popen(  # noqa: S603 - a program of ours
         python_command("octasplat.engine.poses.colmap_process"),
         stdin=subprocess.PIPE,

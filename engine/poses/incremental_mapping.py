@@ -50,7 +50,7 @@ def map_photographs(
     options.triangulation.random_seed = seed
     options.ba_use_gpu = False
     options.min_model_size = MIN_PHOTOGRAPHS
-    options.extract_colors = False
+    options.extract_colors = False  # extracted once, for the model that is kept
     if allow_weak_links:
         options.mapper.abs_pose_min_num_inliers = _WEAK_INLIERS
         options.mapper.init_min_num_inliers = _WEAK_INITIAL_INLIERS
@@ -59,14 +59,14 @@ def map_photographs(
 
     def first_pair() -> None:
         nonlocal placed
-        placed = 2
+        placed = 2  # a new model begins: its photographs are counted anew
 
     def another() -> None:
         nonlocal placed, most
         placed += 1
         if placed > most:
             most = placed
-            on_count(most)
+            on_count(most)  # a smaller model is no progress
 
     folder = database.with_name("models")
     shutil.rmtree(folder, ignore_errors=True)

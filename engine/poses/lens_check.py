@@ -73,6 +73,7 @@ def _reprojection_errors(
     points_cam: Float64[np.ndarray, "k 3"], xy_px: Float64[np.ndarray, "k 2"], camera: Camera
 ) -> tuple[float, float] | None:
     """Return the mean reprojection error now, and after the best shift, rotation and translation."""
+    # points behind the camera have no place in the picture
     points_cam, xy_px = points_cam[points_cam[:, 2] > 0], xy_px[points_cam[:, 2] > 0]
     away = xy_px - camera.project(points_cam)
     fine = np.isfinite(away).all(axis=1)
@@ -80,7 +81,9 @@ def _reprojection_errors(
     if len(away) < MIN_OBSERVATIONS:
         return None
     flow = image_motion_by_pose(points_cam, camera, float(np.median(points_cam[:, 2])))
+    # the pose's six numbers, and a shift of the picture
     slopes = np.concatenate([flow, np.broadcast_to(np.eye(2), (len(away), 2, 2))], axis=2)
+    # alike in size, so that one ridge suits all
     slopes = slopes / np.sqrt(np.square(slopes).mean(axis=(0, 1)) + 1e-30)
     distances = first = np.linalg.norm(away, axis=1)
     least = max(float(np.median(first)), 1e-9)
@@ -88,6 +91,7 @@ def _reprojection_errors(
         weights = 1 / np.maximum(distances, least)
         curvature = np.einsum("nck,ncl,n->kl", slopes, slopes, weights)
         downhill = np.einsum("nck,nc,n->k", slopes, away, weights)
+        # against a singular system, as of points in one plane
         ridge = 1e-9 * np.trace(curvature) * np.eye(len(curvature))
         motion = np.linalg.solve(curvature + ridge, downhill)
         distances = np.linalg.norm(away - np.einsum("nck,k->nc", slopes, motion), axis=1)

@@ -43,12 +43,14 @@ def select_pairs(
 
 def batch_pairs(pairs: Iterable[Pair], size: int) -> list[tuple[Pair, ...]]:
     """Yield pairs in batches, those of the same photographs together, as COLMAP loads each only once then."""
+    # tiles of pairs, in which COLMAP's cache finds its photographs again
     ordered = sorted(pairs, key=lambda pair: (pair[0] // _TILE, pair[1] // _TILE, pair))
     return [tuple(ordered[start : start + size]) for start in range(0, len(ordered), size)]
 
 
 def largest_features(keypoints: Float32[np.ndarray, "n 6"], count: int) -> Int64[np.ndarray, " k"]:
     """Return the sorted indices of the ``count`` features of largest scale; columns as in COLMAP."""
+    # determinant of the affine shape
     area = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
     kept: Int64[np.ndarray, " k"] = np.sort(np.argsort(-area, kind="stable")[:count])
     return kept

@@ -67,6 +67,7 @@ def photographs_sha256(folder: Path, names: Sequence[str]) -> str:
     """Return a SHA-256 over the names and contents of the photographs."""
     digest = hashlib.sha256()
     for name in names:
+        # names and sizes first, so that contents cannot run into each other
         digest.update(f"{name}\0{(folder / name).stat().st_size}\n".encode())
         with (folder / name).open("rb") as content:
             digest.update(hashlib.file_digest(content, "sha256").digest())

@@ -78,6 +78,7 @@ def sampson_distances(
     turned = np.einsum("ij,pkj->pik", rotation_cam_from_world, matches.rotations_cam_from_world)
     moved = translation_cam_from_world - np.einsum("pij,pj->pi", turned, matches.translations_cam_from_world)
     rotation, translation = turned[matches.partner], moved[matches.partner]
+    # epipolar lines in the photograph: t x R x'
     lines = np.cross(translation, np.einsum("mij,mj->mi", rotation, matches.partner_rays_cam))
     partner_lines = np.einsum("mji,mj->mi", rotation, np.cross(matches.rays_cam, translation))
     slopes = np.concatenate([lines[:, :2], partner_lines[:, :2]], axis=1)
@@ -99,6 +100,7 @@ def refine_pose(
         close = matches.select(inlier_mask(pose, matches, inlier_distance))
         if len(close.partner) < _DEGREES_OF_FREEDOM:
             break
+        # again with the matches that agree with the better pose
         pose = _minimise_sampson(pose, close, inlier_distance)
     return pose
 
@@ -106,6 +108,7 @@ def refine_pose(
 def _minimise_sampson(pose: Pose, matches: Matches, inlier_distance: float) -> Pose:
     """Return the pose, starting from ``pose``, that minimises the robust Sampson distances of the matches."""
     rotation, translation = pose
+    # shifts in units of the distance to the others, so that all six numbers are alike in size
     size = float(np.median(np.linalg.norm(translation - matches.translations_cam_from_world, axis=1)))
 
     def moved(step: Float64[np.ndarray, " 6"]) -> Pose:
@@ -140,6 +143,7 @@ def collect_matches(
         def rays_of(which: int) -> Float64[np.ndarray, "f 3"]:
             camera = model.cameras[images[which].camera_id]
             width_px, height_px = sizes_px[which - 1]
+            # keypoints are in pixels of the photograph on disk, cameras may be of another size
             scale = (camera.width / width_px, camera.height / height_px)
             flat = camera.cam_from_img(source.read_keypoints(which)[:, :2].astype(np.float64) * scale)
             return np.concatenate([flat, np.ones((len(flat), 1))], axis=1)

@@ -139,6 +139,7 @@ class _PoseVerifier:
         return estimate_pose(matches, self._given_pose(k), self._inlier_distance(k), seed=self._config.seed)
 
     def _matches(self, k: int) -> Matches | None:
+        # other doubtful photographs say nothing reliable
         asked = {k, *self._matched_pairs} - (self._doubtful - {k})
         images = {number + 1: self.images[number] for number in asked}
         return collect_matches(k + 1, self.model, images, self._database, self._sizes_px)
@@ -165,6 +166,7 @@ def _evenly_spaced(numbers: Sequence[int], count: int) -> list[int]:
 def _set_pose(model: Any, image: Any, pose: Pose) -> None:
     """Set another pose of an image and delete its observations, which belong to the former pose."""
     cam_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(pose[0]), pose[1])
+    # the camera's place in its rig stays
     cam_from_rig = image.cam_from_world() * image.frame.rig_from_world.inverse()
     image.frame.rig_from_world = cam_from_rig.inverse() * cam_from_world
     for index, point in enumerate(image.points2D):

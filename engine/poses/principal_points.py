@@ -91,6 +91,7 @@ def _adjust_per_view_principal_points(
     shared: Any, given: Any, error_px: float, on_count: Callable[[int], None]
 ) -> Any | None:
     """Return ``shared`` adjusted with lenses per view and aligned to ``given``; None where it fails."""
+    # too few observations to know a lens from
     fixed = {i for i, image in shared.images.items() if image.num_points3D < MIN_OBSERVATIONS}
     for k in range(_ITERATIONS):
         model = _split_cameras(shared)
@@ -98,6 +99,7 @@ def _adjust_per_view_principal_points(
             return None
         _align_to_given(model, given)
         on_count(k + 1)
+        # those whose principal point ran away get the shared one again
         astray = {i for i in model.images if _shift_px(model, given, i) > MAX_SHIFT * _side_px(model, i)}
         if not astray:
             model.update_point_3d_errors()
@@ -134,7 +136,7 @@ def _bundle_adjust(model: Any, fixed: set[int], error_px: float) -> bool:
     options.refine_focal_length = options.refine_extra_params = False
     options.refine_principal_point = True
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
-    options.ceres.loss_function_scale = 2 * error_px
+    options.ceres.loss_function_scale = 2 * error_px  # twice the mean error: outliers count little
     options.ceres.solver_options.num_threads = 1  # more would add up in the order in which they come
     options.ceres.solver_options.max_num_iterations = _MAX_SOLVER_STEPS
     options.ceres.solver_options.function_tolerance = 1e-5

@@ -97,6 +97,7 @@ class PoseSearch:
                     "more features."
                 )
             )
+            # max keeps the first of equals: the usual search
             best = max(best, self._search(thorough=True), key=model_rank)
         self._check_model(best)
         # One after the other: colors are sums.
@@ -139,6 +140,7 @@ class PoseSearch:
     def _find_features(self, database: Path, thorough: bool) -> None:
         with progress_stage(FEATURES, len(self._names), self._progress) as at:
             if not database.exists():
+                # made under another name, so that a database that is there is whole
                 new = database.with_suffix(".new")
                 new.unlink(missing_ok=True)
                 create_database(new, self._photographs, self._aliases, one_camera=self._one_camera)
@@ -188,12 +190,14 @@ class PoseSearch:
             false = find_false_pairs(votes)
             if len(false) == 0:
                 break
+            # on a copy: the false pairs come back if the trial is no better
             trial = database.with_name("trial.db")
             shutil.copyfile(database, trial)
             remove_pairs(trial, false)
             again = map_photographs(trial, self._photographs, seed=self._config.seed, on_count=at)
             if model_rank(again)[0] < model_rank(model)[0]:
                 break
+            # fewer matches explained: the cut was no fold
             if count_pair_inliers(again, trial).inliers.sum() <= votes.inliers.sum():
                 break
             trial.replace(database)

@@ -38,7 +38,7 @@ def _write_png(photograph: Path, target: Path) -> None:
     """Write the display colors of a photograph as a PNG of 8 bits."""
     info = read_image_info(photograph)
     colors, _ = read_photo(photograph, info.width_px, info.height_px, 8)
-    Image.fromarray(colors).save(target, compress_level=1)
+    Image.fromarray(colors).save(target, compress_level=1)  # fast: the file is temporary
 
 
 @contextmanager

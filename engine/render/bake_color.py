@@ -63,11 +63,13 @@ def fit_colors_to_cameras(
     batches = [_rays_in_tile_order(make()) for make in images]
     on_pass(0, steps + 2)
     tracer.build(gaussians)
+    # --- what each Gaussian shows each camera, weighted by how much it is seen ---
     targets, sums, weights = [], np.zeros((len(gaussians), 3)), np.zeros(len(gaussians))
     for rays in batches:
         traced = tracer.trace(rays, record=True)
         targets.append(traced.rgb_srgb.astype(np.float64))
         assert traced.recording is not None
+        # backward of zeros: only the sums of weights are wanted
         found = tracer.backward(traced.recording, TraceGradients(np.zeros_like(traced.rgb_srgb))).numpy()
         away = gaussians.means_world[found.ids] - rays.origins_world[0]
         away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
@@ -121,7 +123,7 @@ def _conjugate_gradients(
     on_pass: Callable[[int, int], None],
 ) -> Float64[np.ndarray, "n 3"]:
     """Take steps towards the minimum of |W c - y|^2 + HELD |c - start|^2, each channel on its own."""
-    scale = (weights + REGULARISATION)[:, None]
+    scale = (weights + REGULARISATION)[:, None]  # preconditioner: about the diagonal of W^T W
     colors = start.copy()
     rest = -normal(colors, targets)
     on_pass(2, steps + 2)

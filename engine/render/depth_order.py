@@ -28,7 +28,7 @@ def shared_depth_order(
     for viewer in viewers_world:
         total += _depth_ranks(points_world, viewer)
     order = np.argsort(-total, kind="stable")
-    if len(points_world) < 2 or len(viewers_world) == 0:
+    if len(points_world) < 2 or len(viewers_world) == 0:  # nothing to correlate
         return order, 1.0
     shared = rankdata(total)
     agreement = [np.corrcoef(shared, _depth_ranks(points_world, viewer))[0, 1] for viewer in viewers_world]

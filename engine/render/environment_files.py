@@ -47,7 +47,7 @@ def read_environment(path: Path, warn: Callable[[str], None] | None = None) -> F
             f"{path}: {invalid.sum():,} of {invalid.size:,} pixels hold values that are negative or not "
             "finite; negative ones count as 0, infinite ones as the brightest pixel, others as 0."
         )
-        brightest = rgb[np.isfinite(rgb)].max()
+        brightest = rgb[np.isfinite(rgb)].max()  # an infinite value is a lamp beyond the format's range
         rgb = np.maximum(np.nan_to_num(rgb, nan=0.0, posinf=brightest, neginf=0.0), 0.0)
     if warn is not None:
         height, width = rgb.shape[:2]

@@ -27,6 +27,7 @@ def unique_render_names(photographs: Sequence[str]) -> tuple[str, ...]:
 def has_number_pattern(pattern: Path) -> bool:
     """Return whether a file name has one place for a number, as ``frame_%04d.png``."""
     try:
+        # with a place for a number, two numbers give two names
         return bool(pattern.name % 0 != pattern.name % 1)
     except (TypeError, ValueError):
         return False

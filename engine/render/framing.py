@@ -60,7 +60,7 @@ def visible_bounds(gaussians: FlatGaussians, up_world: Float64[np.ndarray, "3"])
     outwards = np.linalg.norm(across - middle, axis=1)
     radius = max(_robust_range(outwards, reach, weights)[1], 0.0)
     half_height = 0.5 * (high - low)
-    smallest = 1e-6 * max(radius, half_height, float(reach.max()))
+    smallest = 1e-6 * max(radius, half_height, float(reach.max()))  # a point or a line has a size as well
     return VisibleBounds(
         middle + 0.5 * (low + high) * up, up, max(radius, smallest), max(half_height, smallest)
     )
@@ -69,6 +69,7 @@ def visible_bounds(gaussians: FlatGaussians, up_world: Float64[np.ndarray, "3"])
 def core_gaussians(gaussians: FlatGaussians) -> Bool[np.ndarray, " n"]:
     """Return the Gaussians that are neither faint nor far outside of most others; at least one."""
     opacities = gaussians.opacities
+    # a scene of haze alone is framed by its densest half
     solid = opacities >= min(_MIN_OPACITY, 0.5 * float(opacities.max()))
     points = gaussians.means_world.astype(np.float64)
     centre = np.median(points[solid], axis=0)
@@ -94,6 +95,7 @@ def fitting_distance(
     along, across = bounds.radius * np.cos(angles), bounds.radius * np.sin(angles)
     needed = 0.0
     for height in (-bounds.half_height, bounds.half_height):
+        # seen from the camera: how much nearer, and how far up, each rim point lies
         nearer = along * np.cos(elevation) + height * np.sin(elevation)
         upwards = height * np.cos(elevation) - along * np.sin(elevation)
         reach = np.maximum(np.abs(across) / slope_x, np.abs(upwards) / slope_y)
@@ -115,5 +117,5 @@ def _weighted_quantile(
     values: Float64[np.ndarray, " n"], weights: Float64[np.ndarray, " n"], quantile: float
 ) -> float:
     order = np.argsort(values)
-    sums = np.cumsum(weights[order])
+    sums = np.cumsum(weights[order])  # beyond the sums by rounding: the last value
     return float(values[order[min(int(np.searchsorted(sums, quantile * sums[-1])), len(order) - 1)]])

@@ -111,6 +111,7 @@ def _turntable(
         table = turntable_of_views(viewpoints)
     if orbit.target_world is not None:
         table = replace(table, centre_world=orbit.target_world)
+    # of the photographs or the fitted circle, measured from the middle
     distance = orbit.distance_world or float(np.hypot(table.radius, table.height))
     angle = np.arctan2(table.height, table.radius) if elevation is None else np.radians(elevation)
     return replace(table, radius=float(distance * np.cos(angle)), height=float(distance * np.sin(angle)))

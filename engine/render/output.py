@@ -96,7 +96,7 @@ class RenderOutput:
             ConfigError: there are images of another render, or of one that is not to be gone on with.
         """
         how, record = self.resumption, self._record_path
-        return FinishedImages(
+        return FinishedImages(  # several patterns may share a folder
             record.parent, identity, resume=how.resume, or_anew=how.or_anew, record=record.name
         )
 

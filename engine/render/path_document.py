@@ -108,7 +108,7 @@ class PathDocument(BaseModel):
         if self.frames is not None:
             return len(self.frames)
         assert self.seconds is not None
-        return max(2, round(self.seconds * self.fps))
+        return max(2, round(self.seconds * self.fps))  # both ends, even of a very short path
 
 
 def read_path_document(path: Path) -> PathDocument:
@@ -132,7 +132,7 @@ def parse_path_text(value: object) -> object:
     if not isinstance(value, str):
         return value
     try:
-        return json.loads(value)
+        return json.loads(value)  # deeply nested text exhausts the parser's stack
     except (ValueError, RecursionError) as error:
         raise ValueError(f"the camera path is no JSON: {error}") from None
 

@@ -65,10 +65,10 @@ def _between_keys(content: PathDocument, keys: tuple[PinholeCamera, ...]) -> tup
     frames = max(2, round(content.seconds * content.fps))
     times = np.linspace(0.0, 1.0, frames, endpoint=not content.closed)
     if content.ease == "in-out":
-        times = times * times * (3.0 - 2.0 * times)
+        times = times * times * (3.0 - 2.0 * times)  # smoothstep: no speed at both ends
     lenses = np.array([[key.fx_px, key.fy_px, key.cx_px, key.cy_px] for key in keys])
     if content.closed:
-        lenses = np.concatenate([lenses, lenses[:1]])
+        lenses = np.concatenate([lenses, lenses[:1]])  # back to the first lens
     between = np.stack([np.interp(times, path.key_times, lens) for lens in lenses.T], axis=1)
     return tuple(
         PinholeCamera.from_pose(pose, content.width, content.height, fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy)

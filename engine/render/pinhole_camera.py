@@ -116,6 +116,7 @@ class PinholeCamera:
     def project(self, points_world: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 2"]:
         """Return the pixel coordinates of points; NaN for those not in front of the camera."""
         points_cam = points_world @ self.rotation_cam_from_world.T + self.translation_cam_from_world
+        # not-a-number propagates to both coordinates
         depth = np.where(points_cam[:, 2] > 0, points_cam[:, 2], np.nan)
         across = self.fx_px * points_cam[:, 0] / depth + self.cx_px
         return np.stack([across, self.fy_px * points_cam[:, 1] / depth + self.cy_px], axis=-1)

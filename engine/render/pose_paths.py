@@ -96,9 +96,9 @@ def turntable(
         )
     up = up_world / np.linalg.norm(up_world)
     first = np.zeros(3) if start_world is None else start_world - up * (up @ start_world)
-    if np.linalg.norm(first) < 1e-9:
+    if np.linalg.norm(first) < 1e-9:  # parallel to the axis, or not given
         helper = np.eye(3)[np.argmin(np.abs(up))]
-        first = helper - up * (up @ helper)
+        first = helper - up * (up @ helper)  # any direction across the axis, the same each time
     first = first / np.linalg.norm(first)
     second = np.cross(up, first)
     angles = 2 * np.pi * turns * np.arange(frames) / frames
@@ -216,7 +216,9 @@ def _catmull_rom_velocities(
     slopes = np.diff(positions, axis=0) / spans
     if len(slopes) == 1:
         return np.concatenate([slopes, slopes])
+    # derivative of the parabola through three keys, at the middle one
     inner = (slopes[:-1] * spans[1:] + slopes[1:] * spans[:-1]) / (spans[:-1] + spans[1:])
+    # at the ends the derivative of the outer parabola
     return np.concatenate([2 * slopes[:1] - inner[:1], inner, 2 * slopes[-1:] - inner[-1:]])
 
 
@@ -224,6 +226,7 @@ def _nearest_to_axes(
     centres: Float64[np.ndarray, "n 3"], forwards: Float64[np.ndarray, "n 3"]
 ) -> Float64[np.ndarray, "3"]:
     """Return the point with the least sum of distances to lines, by reweighted least squares."""
+    # I - d d^T: distance vectors to the line
     across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]
     projected = np.einsum("nij,nj->ni", across, centres)
     extent = float(np.linalg.norm(np.ptp(centres, axis=0)))
@@ -231,7 +234,7 @@ def _nearest_to_axes(
     point = np.zeros(3)
     for _ in range(30):
         matrix = np.einsum("n,nij->ij", weights, across) / weights.sum()
-        if np.linalg.eigvalsh(matrix)[0] < 1e-5:
+        if np.linalg.eigvalsh(matrix)[0] < 1e-5:  # all axes parallel: the smallest eigenvalue vanishes
             raise ConfigError(
                 "The cameras all look the same way, so that they have no common centre; "
                 "give the turntable's centre yourself."
@@ -241,5 +244,6 @@ def _nearest_to_axes(
         if np.linalg.norm(point - before) < 1e-9 * max(extent, 1e-12):
             break
         distances = np.linalg.norm(np.einsum("nij,nj->ni", across, point - centres), axis=-1)
+        # weights 1 / distance: the sum of distances instead of squares
         weights = 1.0 / np.maximum(distances, max(1e-3 * extent, 1e-12))
     return point

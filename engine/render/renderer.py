@@ -71,6 +71,7 @@ def render_rays(
     )
     for band, order, rays in _row_bands(image):
         traced = tracer.trace(rays)
+        # by the pixel in the whole image, so that bands change nothing
         dither = pixel_jitter(band.start * width + order, sample)
         shaded = shading.shade(TracedRays(rays, traced, tracer, dither=dither))
         rgb = shaded.composite_over(background)
@@ -84,6 +85,7 @@ def render_rays(
             (out.normal_world, face_viewer(traced.normal_world, rays.directions_world).normal_world),
             *((layers[name], values) for name, values in shaded.layers.items()),
         ):
+            # from tile order back to rows
             part[band].reshape(len(order), -1)[order] = values.reshape(len(order), -1)
     return out
 
@@ -163,7 +165,7 @@ def _row_bands(
 ) -> Iterator[tuple[slice, Int64[np.ndarray, " r"], RayBatch]]:
     """Yield bands of an image: its rows, the pixels' numbers in tiles, and their rays."""
     height, width = image.height_px, image.width_px
-    rows = max(1, rays_at_once // (width * TILE_SIZE)) * TILE_SIZE
+    rows = max(1, rays_at_once // (width * TILE_SIZE)) * TILE_SIZE  # whole tiles, so that packets are full
     for top in range(0, height, rows):
         count = min(rows, height - top)
         order = tile_order(count, width)

@@ -51,6 +51,7 @@ class FinishedImages:
         digest = self._digests.get(self._name(path))
         if digest is None:
             return False
+        # moved images are believed, files are read
         return self._moved.get(self._name(path)) == digest or (path.is_file() and _sha256(path) == digest)
 
     def add(self, path: Path) -> None:
@@ -61,7 +62,7 @@ class FinishedImages:
             OutputError: the record cannot be written.
         """
         name, digest = self._name(path), _sha256(path)
-        lines = [] if self._digests else [{"identity": self._identity}]
+        lines = [] if self._digests else [{"identity": self._identity}]  # the first line names the series
         text = "".join(json.dumps(line) + "\n" for line in [*lines, {"file": name, "sha256": digest}])
         try:
             with report_disk_full(self.record), self.record.open("a" if self._digests else "w") as file:
@@ -87,7 +88,7 @@ class FinishedImages:
             raise ConfigError(f"{self.record} cannot be read ({error}); remove it.") from None
         # A kill may have cut the last line short; its image is rendered again.
         complete = [line for line in lines if line.endswith("\n")]
-        if len(complete) < 2:
+        if len(complete) < 2:  # only a header: nothing was finished
             return self._forget()
         if not resume:
             if or_anew:
@@ -108,7 +109,7 @@ class FinishedImages:
                 f"{self.folder} holds images of another render (its scene, stage, cameras or version "
                 "differ); say --overwrite to begin anew."
             )
-        if len(lines) > len(complete):
+        if len(lines) > len(complete):  # a cut last line would join with the next one
             write_text(self.record, "".join(complete))
         self._remove_partial()
         return digests

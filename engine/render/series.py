@@ -95,6 +95,7 @@ def render_video(
                 progress=progress,
                 on_finished=on_finished,
             ):
+                # read back, so that resumed frames and new ones are the same
                 video.write(_display_values(path))
         film.parent.mkdir(parents=True, exist_ok=True)
         unfinished.replace(film)
@@ -119,9 +120,8 @@ def _render_missing(
     total = len(shots)
     for number, shot in enumerate(shots):
         path = file_of(number, shot)
-        if not finished.is_finished(
-            path
-        ):  # nothing is told of the others, lest they count for the time that is left
+        # Nothing is told of the others, lest they count for the time that is left.
+        if not finished.is_finished(path):
 
             def part(share: float, done: int = number) -> None:
                 if share < 1:

@@ -95,7 +95,7 @@ def turntable_of_views(viewpoints: Viewpoints) -> Turntable:
     """
     rotations = np.stack([view.rotation_cam_from_world for view in viewpoints.views])
     centres = np.stack([view.origin_world for view in viewpoints.views])
-    return fit_turntable(centres, rotations[:, 2], -rotations[:, 1])
+    return fit_turntable(centres, rotations[:, 2], -rotations[:, 1])  # camera axes: +z is forward, -y is up
 
 
 def fov_y_of_views(viewpoints: Viewpoints) -> float:
@@ -199,6 +199,7 @@ def _view_rays(view: PosedView, camera: Camera, near_world: float) -> ImageRays:
     for top in range(0, height, rows):
         y, x = np.mgrid[top : min(top + rows, height), 0:width] + 0.5
         directions = camera.directions_cam(np.stack([x.ravel(), y.ravel()], axis=1))
+        # outside of the lens's range there is no direction
         directions[np.isnan(directions).any(axis=1)] = (0.0, 0.0, 1.0)
         world = directions @ view.rotation_cam_from_world
         directions_world[top : top + rows] = world.reshape(-1, width, 3)

@@ -70,13 +70,14 @@ def pixel_means(
         coverage += found.alpha / side**2
         np.minimum(lowest, found.rgb_srgb, out=lowest)
         np.maximum(highest, found.rgb_srgb, out=highest)
-    finer = min(2 * side, MAX_RAYS_PER_SIDE)
+    finer = min(2 * side, MAX_RAYS_PER_SIDE)  # twice as fine where rays differ, but not beyond the most
     order = tile_order(*size)
     uneven = order[((highest - lowest).max(axis=2) > UNEVEN_RATIO).reshape(-1)[order]]
     if finer > side and len(uneven):
         light.reshape(-1, 3)[uneven], coverage.reshape(-1)[uneven] = 0, 0
         for number, (across, down) in enumerate(_subpixel_offsets(finer)):
             part(0.5 + number / (2 * finer**2))
+            # sample numbers go on, so that no dither comes twice
             shifted, sample = image.shifted(across, down), side**2 + number
             linear, alpha = shade_layer(
                 tracer=tracer, image=shifted, pixels=uneven, shading=shading, layer=LINEAR, sample=sample
@@ -97,7 +98,7 @@ def pixel_angle(image: ImageRays) -> float:
         pair = ways[row - 1, column], ways[row, column]
     else:
         return 0.0
-    return float(np.linalg.norm(np.cross(*pair)))
+    return float(np.linalg.norm(np.cross(*pair)))  # the sine of a small angle
 
 
 def rays_per_pixel_side(image: ImageRays, trained_rad: float) -> int:
@@ -129,6 +130,7 @@ def render_averaged(
     rgb, alpha = np.zeros(centre.rgb_srgb.shape), np.zeros(centre.alpha.shape)
     for number, (across, down) in enumerate(_subpixel_offsets(side)):
         shifted = image.shifted(across, down)
+        # the center's ray is not traced twice
         found = centre if shifted is image else render_rays(tracer, shifted, background_srgb, shading, number)
         rgb += found.rgb_srgb
         alpha += found.alpha
@@ -152,6 +154,7 @@ def render_filtered(
         return centre
     means = pixel_means(tracer, image, shading, side)
     alpha = means.alpha[..., None]
+    # clipped before the blend, as a photograph's pixel is
     rgb = linear_to_srgb(np.minimum(means.linear, 1.0)) * alpha + (1 - alpha) * background
     return replace(centre, rgb_srgb=rgb.astype(np.float32), alpha=means.alpha)
 

@@ -19,10 +19,11 @@ def estimate_up(rotations_cam_from_world: Float64[np.ndarray, "n 3 3"]) -> Float
     if length < 1e-3:
         return np.array([0.0, -1.0, 0.0])  # COLMAP's y points down
     mean = mean / length
+    # right axes span the plane across up: it is the least eigenvector
     spread = rights.T @ rights / len(rights) + 0.01 * (np.eye(3) - np.outer(mean, mean))
     up = np.linalg.eigh(spread)[1][:, 0]
     agreement = float(up @ mean)
-    return np.asarray(up * np.sign(agreement) if abs(agreement) > 0.5 else mean)
+    return np.asarray(up * np.sign(agreement) if abs(agreement) > 0.5 else mean)  # an eigenvector has no sign
 
 
 def upright_frame(
@@ -41,6 +42,7 @@ def upright_frame(
     away = centres_world - focus_world
     sideways = away - (away @ up)[:, None] * up
     front = sideways.mean(axis=0)
+    # all around: no side is the front
     if np.linalg.norm(front) < MIN_SIDE * np.linalg.norm(sideways, axis=1).mean():
         front = sideways[0]
     if np.linalg.norm(front) < 1e-9:

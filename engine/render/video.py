@@ -138,6 +138,7 @@ class VideoWriter:
         return [
             imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error",
             "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", f"{self._fps:g}", "-i", "-",
+            # full-range sRGB to BT.709 video levels
             "-vf", "scale=out_color_matrix=bt709:out_range=tv", "-an",
             "-c:v", "libx264", "-crf", str(self._crf), "-preset", "medium", "-pix_fmt", "yuv420p",
             "-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "iec61966-2-1",

@@ -53,6 +53,7 @@ class BakedScene:
         if self._gaussians.sh_degree == 0:
             return self._gaussians
         if self._run is None:
+            # cameras all around, as nothing is known of the photographs
             settings, images = TraceSettings(), _rays_around(self._gaussians)
         else:
             try:

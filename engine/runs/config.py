@@ -50,6 +50,7 @@ class ReconstructionConfig(RunSettings):
             return values
         train = values.get("train", {})
         train_background = train.get("background") if isinstance(train, Mapping) else train.background
+        # auto, random and learnt backgrounds are no fixed color
         return {**values, "evaluation_background": "white" if train_background == "white" else "black"}
 
     def background_mismatch(self, has_alpha: bool) -> str | None:
@@ -99,9 +100,11 @@ def resolve_config(
         InvalidSettingsError: an unknown name, a value out of range, or settings that contradict each other.
     """
     given = {key: value for key, value in (settings or {}).items() if value is not None}
+    # None where nothing was said, so that train or an assignment may decide
     values, changes = _collect_changes(
         {**given, "preset": preset_name}, materials or None, train, assignments
     )
+    # the preset depends on the changes: any of them may switch materials on
     base = _preset_settings(values["preset"], _learns_materials(changes))
     return _validate_config({**values, "train": merge_options(base, changes)})
 
@@ -133,6 +136,7 @@ def revise_requested(requested: Mapping[str, Any], changes: Mapping[str, Any]) -
     kept, train = {**requested, **changes}, changes.get("train", {})
     default = RunSettings.model_fields["preset"].default
     if kept.get("preset", default) == requested.get("preset", default):
+        # settings of the same preset stay, another preset brings its own
         train = merge_options(requested.get("train", {}), train)
     if "depth_normal" in changes.get("train", {}).get("loss", {}) and "for_surface" not in changes:
         kept.pop("for_surface", None)  # which means a value of its own
@@ -169,10 +173,11 @@ def revise_config(
     former: Mapping[str, Any] = before.get("train", {})
     learnt = _learns_materials(former)
     if values.get("preset") != before.get("preset"):
-        former = {}
+        former = {}  # of another preset: none of its settings stay
     elif _learns_materials(merge_options(former, changes)) == learnt:
         return _validate_config({**values, "train": merge_options(former, changes)})
     else:
+        # materials were switched: what differs from the old preset stays, the new one gives the rest
         former = _changed_values(_preset_settings(before.get("preset"), learnt), former)
     requested = merge_options(former, changes)
     base = _preset_settings(values.get("preset"), _learns_materials(requested))
@@ -190,7 +195,7 @@ def read_config(path: Path) -> ReconstructionConfig:
         return _validate_config(
             replace_former_names((ReconstructionConfig,), content["reconstruction"], source=str(path))
         )
-    except InvalidSettingsError as error:
+    except InvalidSettingsError as error:  # not told as damage: the file is of another version
         raise ConfigError(f"{path} is not a configuration of this version: {error}") from None
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(
@@ -213,10 +218,10 @@ def _collect_changes(
         changes = merge_options(changes, train)
     for assignment in assignments:
         path, value = _read_assignment(assignment)
-        for name in reversed(path):
+        for name in reversed(path):  # from the innermost name outwards
             value = {name: value}
         value = replace_former_names((RunSettings, TrainConfig), value)
-        if RunSettings.model_fields.keys() & value:
+        if RunSettings.model_fields.keys() & value:  # a setting of the run, not of its training
             values |= value
             continue
         _check_names(value)
@@ -240,9 +245,9 @@ def _read_assignment(assignment: str) -> tuple[list[str], Any]:
     try:
         value = json.loads(text)
     except ValueError:
-        value = text
+        value = text  # a text needs no quotes
     path = name.split(".")
-    return path[1:] if path[0] == "train" and len(path) > 1 else path, value
+    return path[1:] if path[0] == "train" and len(path) > 1 else path, value  # train. may be left out
 
 
 def _preset_settings(preset_name: object, materials: bool) -> dict[str, Any]:
@@ -266,7 +271,7 @@ def _learns_materials(train: Mapping[str, Any]) -> bool:
     try:
         return isinstance(materials, Mapping) and _BOOL.validate_python(materials.get("learn", False))
     except ValidationError:
-        return False
+        return False  # refused later, with a sentence that names it
 
 
 _BOOL = TypeAdapter(bool)
@@ -277,6 +282,7 @@ def _changed_values(base: Mapping[str, Any], values: Mapping[str, Any]) -> dict[
     found: dict[str, Any] = {}
     for key, value in values.items():
         old = base.get(key)
+        # sections of another kind have other fields: they differ as a whole
         if isinstance(value, Mapping) and isinstance(old, Mapping) and value.get("kind") == old.get("kind"):
             if inner := _changed_values(old, value):
                 found[key] = inner
@@ -310,6 +316,7 @@ def _unknown_paths(
         infos = [model.model_fields[key] for model in models if key in model.model_fields]
         if not infos:
             former = (model.former_settings for model in models if issubclass(model, Settings))
+            # former settings are read, and refused elsewhere if they differ
             if not any(key in names for names in former):
                 yield from _leaf_paths(value, place)
         elif isinstance(value, Mapping):

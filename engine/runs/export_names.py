@@ -20,7 +20,7 @@ def check_export_name(name: str) -> str:
     """Return the file name if its format is known and no other result has it; raise ValueError otherwise."""
     from octasplat.engine.files import exporter_for
 
-    if not _FILE_NAME.fullmatch(name) or ".." in name:
+    if not _FILE_NAME.fullmatch(name) or ".." in name:  # the name becomes a path in the run's folder
         raise ValueError("name a file such as viewer.glb: letters, digits, '.', '_' and '-'")
     if name.lower() in _TAKEN:
         raise ValueError(f"{name} is the name of another result")

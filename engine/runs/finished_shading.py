@@ -46,6 +46,7 @@ def finished_shading(
     known = run_exposures(output) if view_names else None
     shading = make_shading(replace(options, learns_exposure=known is not None), len(view_names), extent_world)
     if (deferred := find_deferred(shading)) is not None:
+        # EXR if there is one, as it was learnt
         deferred.light.set_radiance(read_environment(run_environment(output)))
     if (background := find_background(shading)) is not None:
         background.set_map(read_background_map(output / BACKGROUND))

@@ -36,6 +36,7 @@ EVALUATIONS = "on"
 
 def is_run(source: Path) -> bool:
     """Return whether ``source`` is a run folder, not a file or the folder of an unpacked SOG."""
+    # an unpacked SOG is a folder with meta.json
     return source.is_dir() and not (source / "meta.json").exists()
 
 
@@ -61,7 +62,7 @@ def photographs_folder(output: Path, scene: Path | None = None) -> Path:
     if scene is not None:
         return scene
     noted = dataset_folder_of_run(output)
-    if noted.is_absolute() and noted.is_dir():
+    if noted.is_absolute() and noted.is_dir():  # a downloaded run names a folder of another machine
         return noted
     raise DatasetError(
         f"The photographs that {output} was made from ({noted}) are not on this machine; "
@@ -85,7 +86,7 @@ def run_viewpoints(
     """
     config = read_config(output / CONFIG)
     max_side = max_side or config.max_side
-    if scene is None and (output / VIEWS).exists():
+    if scene is None and (output / VIEWS).exists():  # no photographs are needed
         return read_views(output / VIEWS).viewpoints(max_side)
     photographs = load_dataset_model(
         photographs_folder(output, scene),
@@ -133,6 +134,7 @@ def run_min_view_distance(output: Path, viewpoints: SplitViewpoints) -> float:
         ConfigError: ``output`` is no run.
     """
     noted = read_metadata(output / SCENE).near_world if (output / SCENE).exists() else 0.0
+    # scenes of old do not say
     return noted if noted > 0 else read_config(output / CONFIG).train.near * viewpoints.extent
 
 

@@ -51,7 +51,7 @@ def find_missing_poses(
     if config.poses == "given" or (config.poses == "missing" and has_model(scene)):
         return
     names = photographs_of_scene(scene)
-    if not (output / POSES).is_dir():
+    if not (output / POSES).is_dir():  # a search that has begun was let through before
         _refuse_before_search(scene, names, config, threads)
     find_poses(
         image_folder(scene),
@@ -99,6 +99,7 @@ def repair_run_poses(
         CancelledError: stopped as asked.
     """
     is_long = _is_long(dataset, config)
+    # poses that were found are not given ones
     if not (config.train.repair_poses and is_long) or found_model_folder(output) is not None:
         return False
     with phase("check", progress, COARSE_ITERATIONS):
@@ -149,6 +150,7 @@ def _find_misplaced_views(
     """Return the views whose poses a short training puts in doubt, in order."""
     if len(dataset.train_indices) < MIN_VIEWS:
         return np.zeros(0, np.int64)
+    # a few seconds do not learn a map: behind everything is what the photographs' alpha says
     if background == "learnt":
         background = "auto"
     try:
@@ -185,7 +187,7 @@ def estimate_principal_points(
     """
     if not (config.train.per_view_principal_point and _is_long(dataset, config)):
         return False
-    if "lenses" in read_pose_record(output / POSES):
+    if "lenses" in read_pose_record(output / POSES):  # was asked and answered by an earlier start
         return False
     if not needs_per_view_principal_points(dataset.viewpoints, dataset.points, dataset.observations):
         return False

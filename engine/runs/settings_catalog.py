@@ -21,7 +21,7 @@ from octasplat.engine.settings.refusals import InvalidSettingsError, refuse_unkn
 
 MATERIALS = "+materials"
 """What is added to the name of a preset where materials are learnt with it."""
-_ABSENT = object()
+_ABSENT = object()  # None is a value
 
 
 @dataclass(frozen=True)
@@ -80,13 +80,13 @@ def all_settings() -> tuple[Setting, ...]:
         name + (MATERIALS if materials else ""): setting_values(resolve_config(name, materials=materials))
         for name in PRESETS
         for materials in (False, True)
-        if not materials or name in PRESETS_WITH_MATERIALS
+        if not materials or name in PRESETS_WITH_MATERIALS  # redisplats has no settings with materials
     }
     found: dict[str, Setting] = {}
     for name, info in _walk(ReconstructionConfig, ""):
         defaults = {key: value[name] for key, value in values.items() if name in value}
         if name == "preset":
-            defaults = {"standard": "standard"}
+            defaults = {"standard": "standard"}  # each preset is its own default
         found.setdefault(name, _setting_entry(name, info, defaults))
     return tuple(found.values())
 
@@ -156,7 +156,7 @@ def _setting_entry(name: str, info: FieldInfo, defaults: Mapping[str, object]) -
     group: SettingLevel = next((mark.level for mark in info.metadata if isinstance(mark, Group)), "advanced")
     unit = next((mark.symbol for mark in info.metadata if isinstance(mark, Unit)), "")
     kind = _type_text(info.annotation)
-    if name == "densify.kind":
+    if name == "densify.kind":  # the alternatives of a kind are one setting
         kind = " or ".join(dict.fromkeys(str(value) for value in defaults.values()))
     return Setting(
         name=name,

@@ -46,7 +46,7 @@ def small_surface(
     Raises:
         ConfigError: no surface is found.
     """
-    gaussians = replace(gaussians, channels=Channels())
+    gaussians = replace(gaussians, channels=Channels())  # nothing but colors is baked
     cameras, settings = depth_cameras(source, None, gaussians, OPTIONS.depth_side)
     tracer = make_tracer(settings, threads=threads)
     tracer.build(gaussians)

@@ -86,7 +86,7 @@ def training_photographs(
     if not (is_run(source) and (source / CONFIG).exists()):
         return ()
     config = read_config(source / CONFIG)
-    if config.train.materials.learn:
+    if config.train.materials.learn:  # reflections of the photographs are not on the surface
         return ()
     instead = "Colors are those that the scene shows, not those of photographs"
     try:
@@ -95,12 +95,13 @@ def training_photographs(
         progress(Noted(f"{instead}. {error}"))
         return ()
     try:
+        # before anything is decoded
         check_views = partial(_check_same_poses, source, folder)
         opened = open_run_dataset(
             folder, source, config, threads, progress, model_folder=model, check_views=check_views
         )
     except DatasetError as error:
-        if dataset is not None:
+        if dataset is not None:  # those that were named must fit
             raise
         progress(Warned(f"{instead}. {error}"))
         return ()
@@ -131,5 +132,5 @@ def _photograph_rays(
     rgb, alpha, weight = dataset.view_image(index)
     if exposures is not None:
         rgb = exposures.remove_exposure(rgb, index)
-    solid = (alpha * weight)[..., None]
+    solid = (alpha * weight)[..., None]  # premultiplied: what masks leave out has no color
     return dataset.view_rays(index), to_bytes(np.concatenate([rgb * solid, solid], axis=2))

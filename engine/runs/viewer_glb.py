@@ -52,6 +52,7 @@ def prepare_for_viewers(
     Raises:
         DatasetError: the cameras of the run are not known any more.
     """
+    # numbers of Gaussians are for edits
     options = options.model_copy(update={"ids": False, "cores": CORES_OF_CHUNKS})
     if not _has_cameras(source):
         return gaussians, options
@@ -68,6 +69,7 @@ def prepare_for_viewers(
         update={
             "camera": _gltf_camera(
                 cameras[best],
+                # a panorama has six cameras: names do not match them
                 names[best] if len(names) == len(cameras) else "camera",
                 NEAR_SHARE * (distance if math.isfinite(distance) else 1.0),
             ),
@@ -76,7 +78,7 @@ def prepare_for_viewers(
     )
     centres = np.stack([seen.views[index].origin_world for index in seen.train_indices])
     order, agreement = shared_depth_order(gaussians.means_world, centres)
-    if agreement < MIN_AGREEMENT:
+    if agreement < MIN_AGREEMENT:  # chunks, which the viewer sorts by itself
         return gaussians, options
     return gaussians.select(order), options.model_copy(update={"chunks": 1, "cores": CORES_IN_ORDER})
 
@@ -132,6 +134,7 @@ def photographed(
     """
     means = gaussians.means_world.astype(np.float64)
     radii = octagon_radii(gaussians.opacities, q) * np.exp(gaussians.log_scales).max(axis=1)
+    # octagons as a whole, not centers: a large one would widen the box
     inside = (np.abs(means - focus_world) + radii[:, None] <= distance).all(axis=1)
     if inside.sum() < max(1, MIN_SHARE * len(gaussians)):
         return np.ones(len(gaussians), bool)

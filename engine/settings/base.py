@@ -42,7 +42,7 @@ class Settings(BaseModel):
             if name not in values or name in cls.model_fields:
                 continue
             value = values.pop(name)
-            if (list(value) if isinstance(value, tuple) else value) != former.value:
+            if (list(value) if isinstance(value, tuple) else value) != former.value:  # JSON has lists only
                 raise ValueError(
                     f"{name} is no setting any more: it is always {former.value}, not {value}; leave it out"
                 )
@@ -73,6 +73,7 @@ def dump_with_former_settings(settings: Settings) -> dict[str, Any]:
         inner = getattr(settings, name)
         former_value = {new: old for old, new in names.values.get(name, {}).items()}
         if isinstance(inner, Settings):
+            # nested models have former names of their own
             dumped[former_name.get(name, name)] = dump_with_former_settings(inner)
         else:
             dumped[former_name.get(name, name)] = former_value.get(value, value) if former_value else value
@@ -80,5 +81,5 @@ def dump_with_former_settings(settings: Settings) -> dict[str, Any]:
         for constant, former in settings.former_settings.items():
             if former.after == previous:
                 dumped[constant] = former.value
-                previous = constant
+                previous = constant  # several constants may have followed one setting
     return dumped

@@ -64,6 +64,7 @@ class PartialOf:
     def __get_pydantic_json_schema__(
         self, core_schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> JsonSchemaValue:
+        # imported late: the module of options imports nothing heavy
         module, _, name = self.model.partition(":")
         model: type[BaseModel] = getattr(import_module(module), name)
         return handler(model.__pydantic_core_schema__)

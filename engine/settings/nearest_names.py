@@ -20,5 +20,6 @@ def nearest_name(name: str, known: Iterable[str]) -> str | None:
     by_last_part: dict[str, str] = {}
     for full in names:
         by_last_part.setdefault(full.rpartition(".")[2], full)
+    # users may leave out the section
     last = get_close_matches(name.rpartition(".")[2], list(by_last_part), n=1, cutoff=0.75)
     return by_last_part[last[0]] if last else None

@@ -14,6 +14,7 @@ def merge_options(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str,
     for key, value in over.items():
         old = result.get(key)
         if isinstance(old, Mapping) and isinstance(value, Mapping):
+            # values of another kind would be unknown to the new one
             is_same = "kind" not in old or value.get("kind", old["kind"]) == old["kind"]
             result[key] = merge_options(old, value) if is_same else value
         else:

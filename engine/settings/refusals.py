@@ -48,7 +48,7 @@ def refusals_from(error: ValidationError, model: type[BaseModel]) -> list[Refusa
         else:
             path, _, _ = path_in_model(model, fault["loc"])
             refusal = Refusal(path, fault["type"], _fault_sentence(path, fault))
-        found.setdefault(refusal.path, refusal)
+        found.setdefault(refusal.path, refusal)  # pydantic may have several complaints about one setting
     return list(found.values())
 
 
@@ -95,6 +95,7 @@ def submodels(annotation: Any) -> tuple[type[BaseModel], ...]:
 
 def _fault_sentence(path: Sequence[str | int], fault: Mapping[str, Any]) -> str:
     is_ours = fault["type"] == "value_error"
+    # such a sentence names the settings itself
     name = "" if is_ours and tuple(path) == ("train",) else setting_name(path)
     message = str(fault["msg"]).removeprefix("Value error, ").removesuffix(".")
     value = fault.get("input")

@@ -16,6 +16,7 @@ def with_backdrop(mesh: TriangleMesh, centre_world: Float64[np.ndarray, "3"]) ->
         mesh: without colors.
         centre_world: of the sphere, where the cameras are.
     """
+    # beyond the farthest vertex
     radius = RADIUS_FACTOR * float(np.linalg.norm(mesh.vertices_world - centre_world, axis=1).max())
     across = 2 * SPHERE_RINGS
     height = np.pi * np.arange(1, SPHERE_RINGS) / SPHERE_RINGS
@@ -34,6 +35,7 @@ def with_backdrop(mesh: TriangleMesh, centre_world: Float64[np.ndarray, "3"]) ->
     north, south = len(rings), len(rings) + 1
     faces = np.concatenate(
         [
+            # wound as seen from inside
             np.stack([here[:-1], beside[:-1], here[1:]], axis=-1).reshape(-1, 3),
             np.stack([beside[:-1], beside[1:], here[1:]], axis=-1).reshape(-1, 3),
             np.stack([np.full(across, north), beside[0], here[0]], axis=-1),

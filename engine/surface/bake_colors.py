@@ -110,7 +110,7 @@ def _best_cameras(
             inside = ((xy >= 0) & (xy < [camera.width_px, camera.height_px])).all(axis=1)
         # Pixels per length on the surface, up to a factor that all cameras of one scene share more or less.
         merit = np.where(inside & (cosine > MIN_COSINE), cosine * camera.fy_px / length, 0.0)
-        better = np.flatnonzero(merit > weights[:, -1])
+        better = np.flatnonzero(merit > weights[:, -1])  # better than the worst of the best so far
         if len(better) == 0:
             continue
         viewers = np.broadcast_to(camera.centre_world, (len(better), 3))
@@ -144,9 +144,11 @@ def _weighted_means(
         way = points[used] - origins
         directions = way / np.linalg.norm(way, axis=1, keepdims=True)
         traced = tracer.trace(RayBatch(origins, directions, near_world[choice[used, k]]))
+        # rays that met nothing divide by an alpha of 0; they are left out below
         with np.errstate(invalid="ignore", divide="ignore"):
             values = look.read(traced)
         solid = traced.alpha >= MIN_ALPHA
+        # squares favor the best camera
         weight = weights[used[solid], k].astype(np.float64) ** 2
         total[used[solid]] += weight[:, None] * values[solid]
         sums[used[solid]] += weight

@@ -57,7 +57,7 @@ def with_materials(
     local = world_to_tangent(
         _limit_normals(baked[:, 6:].astype(np.float64), surface, known), surface, layout.interpolate(tangents)
     )
-    packed = baked[:, [5, 4, 3]]
+    packed = baked[:, [5, 4, 3]]  # channels as in glTF: occlusion red, roughness green, metallic blue
     return TriangleMesh(
         layout.mesh.vertices_world,
         layout.mesh.faces,
@@ -86,6 +86,7 @@ def _limit_normals(
     rise = (normals * surface_world).sum(axis=1, keepdims=True)
     level = normals - rise * surface_world
     flat = np.linalg.norm(level, axis=1, keepdims=True)
+    # on the cone of the least cosine, in the same direction
     laid = MIN_NORMAL_COSINE * surface_world + np.sqrt(1 - MIN_NORMAL_COSINE**2) * level / np.maximum(
         flat, 1e-9
     )

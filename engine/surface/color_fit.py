@@ -119,6 +119,7 @@ class TexturePalette:
                 of_row = part[:, 1] if down else 1 - part[:, 1]
                 shares.append(of_row * (part[:, 0] if across else 1 - part[:, 0]))
         number, share = np.stack(numbers, axis=1), np.stack(shares, axis=1)
+        # texels that show no surface have no color: the others take their shares
         share[number < 0] = 0.0
         share /= np.maximum(share.sum(axis=1, keepdims=True), 1e-6)
         return np.maximum(number, 0), share.astype(np.float32)
@@ -172,6 +173,7 @@ def _normal_equations(
     progress(0, total)
     for done, picture in enumerate(pictures, 1):
         waiting.append(_pixel_equations(scene, points, *picture()))
+        # several pictures at once: adding a sparse matrix costs as much for few rows
         if sum(len(numbers) for numbers, _, _ in waiting) >= RAYS_PER_BATCH or done == total:
             numbers, shares, rgb = (np.concatenate(parts) for parts in zip(*waiting, strict=True))
             rows = interpolation_matrix(shares, numbers, count)
@@ -189,6 +191,7 @@ def _pixel_equations(
     """Return points and shares of each pixel that shows only surface in both, and its color."""
     observed = rgba.reshape(-1, 4).astype(np.float32) / 255
     samples = [scene.closest(rays.shifted(*offset).rays) for offset in SAMPLES_PER_PIXEL]
+    # rims show what is behind as well
     used = np.flatnonzero(np.all([hits.is_hit for hits in samples], axis=0) & (observed[:, 3] >= MIN_ALPHA))
     numbers, shares = [], []
     for hits in samples:
@@ -197,5 +200,6 @@ def _pixel_equations(
         number, share = points.shares(hits.faces[used], weights)
         numbers.append(number)
         shares.append(share / np.float32(len(samples)))
+    # straight colors: what shines through is no part of the surface
     rgb = np.clip(observed[used, :3] / observed[used, 3:], 0.0, 1.0)
     return np.concatenate(numbers, axis=1), np.concatenate(shares, axis=1), rgb

@@ -56,12 +56,14 @@ def cameras_around(
     table = gaussian_turntable(gaussians, fov_y_degrees=AROUND_FOV_DEGREES)
     distance = float(np.hypot(table.radius, table.height))
     order = np.arange(count)
+    # golden angle steps: a Fibonacci sphere
     height, angle = 1 - (2 * order + 1) / count, order * np.pi * (3 - np.sqrt(5))
     across = np.sqrt(1 - height**2)
     outwards = np.stack([across * np.cos(angle), across * np.sin(angle), height], axis=1)
     focal_px = focal_from_fov(AROUND_FOV_DEGREES, max_side)
     return tuple(
         PinholeCamera.from_pose(
+            # up must not be along the view
             look_at(table.centre_world + distance * out, table.centre_world, _least_aligned_axis(out)),
             max_side,
             max_side,
@@ -81,6 +83,7 @@ def _cube_faces(
 ) -> tuple[PinholeCamera, ...]:
     """Return square pinholes of 90 degrees that together see in all directions."""
     side_px = (
+        # as fine as the panorama itself, at 90 degrees a face
         max_side if camera.pixel_angle_rad == 0 else max(1, min(max_side, round(2 / camera.pixel_angle_rad)))
     )
     return tuple(
@@ -109,6 +112,7 @@ def _pinhole_camera(view: PosedView, camera: Camera, max_side: int, near_world: 
     else:
         middles = [[0.0, height / 2], [width, height / 2], [width / 2, 0.0], [width / 2, height]]
         directions = camera.directions_cam(np.array(middles))
+        # a fisheye's edge may lie behind: the cut takes its place
         ahead = np.isfinite(directions).all(axis=1) & (directions[:, 2] > 0)
         slopes = np.array([-MAX_SLOPE, MAX_SLOPE, -MAX_SLOPE, MAX_SLOPE])
         axis = np.array([0, 0, 1, 1])

@@ -90,7 +90,7 @@ def _stored_image(
 def _depth_values(image: RenderedImage, options: ExtractionOptions) -> Float32[np.ndarray, "h w"]:
     distances = image.depth_median if options.depth_mode == "median" else image.depth
     distances = np.where(image.alpha >= options.min_alpha, distances, UNKNOWN_DEPTH)
-    distances[image.alpha < EMPTY_ALPHA] = EMPTY_DEPTH
+    distances[image.alpha < EMPTY_ALPHA] = EMPTY_DEPTH  # in this order: empty overrides unknown
     if options.depth_trunc is not None:
         distances[(distances > options.depth_trunc) & (distances < EMPTY_DEPTH)] = UNKNOWN_DEPTH
     return distances

@@ -99,7 +99,7 @@ def extract_levels(
     volume_bytes = len(volume.blocks) * BYTES_PER_BLOCK
     with counted_phase("meshing", report, 3) as progress:
         mesh = marching_cubes(volume, options.min_weight)
-        del volume
+        del volume  # large, and not needed any more
         found = len(mesh.faces)
         progress(1, 3)
         mesh = _keep_components(mesh, options)
@@ -114,7 +114,7 @@ def extract_levels(
     result = []
     centre = np.mean([camera.centre_world for camera in cameras], axis=0)
     for mesh in meshes:
-        edges = edge_report(mesh.faces)
+        edges = edge_report(mesh.faces)  # before the backdrop and a texture's seams
         if options.backdrop:
             mesh = with_backdrop(mesh, centre)
         mesh = _bake_colors(
@@ -145,7 +145,7 @@ def _fuse_scene(
     region = choose_region(maps, options)
     with counted_phase("fusing", report, 2 * len(cameras)) as progress:
         volume = fuse_depth_maps(maps, region, options, progress)
-    del maps
+    del maps  # the maps' memory, before colors
     if options.unseen == "solid":
         fill_unseen(volume, options.min_weight)
     return volume, region, renders

@@ -19,6 +19,7 @@ def boundary_loops(faces: Int32[np.ndarray, "m 3"]) -> list[BoundaryLoop]:
     if len(edges) == 0:
         return []
     size = int(faces.max()) + 1
+    # one number an edge: exact in int64
     keys, back = edges[:, 0] * size + edges[:, 1], edges[:, 1] * size + edges[:, 0]
     open_edges = edges[~np.isin(keys, back)]
     after: dict[int, list[int]] = {}
@@ -38,6 +39,7 @@ def boundary_loops(faces: Int32[np.ndarray, "m 3"]) -> list[BoundaryLoop]:
             if vertex in place:
                 loop = path[place[vertex] :]
                 found.append(loop)
+                # what lies on the loop may be visited again by another one
                 for passed in loop[1:]:
                     del place[passed]
                 del path[place[vertex] + 1 :]
@@ -70,6 +72,7 @@ def fill_holes(mesh: TriangleMesh, max_rim: float | None) -> tuple[TriangleMesh,
     closed = 0
     for rim in boundary_loops(mesh.faces):
         corners = points[rim]
+        # length of the rim
         length = float(np.linalg.norm(corners - np.roll(corners, -1, axis=0), axis=1).sum())
         if max_rim is not None and length > max_rim:
             continue
@@ -114,6 +117,7 @@ def _ear_clip(
     def push(k: int) -> None:
         one, two = points[rim[before[k]]] - points[rim[k]], points[rim[after[k]]] - points[rim[k]]
         lengths = float(np.linalg.norm(one) * np.linalg.norm(two))
+        # larger cosine, sharper corner: first out of the heap
         cosine = float(one @ two) / lengths if lengths > 0 else 1.0
         version[k] += 1
         heapq.heappush(queue, (-cosine, k, version[k]))
@@ -126,13 +130,13 @@ def _ear_clip(
     while left > 3:
         while queue:
             _, k, made = heapq.heappop(queue)
-            if made != version[k]:
+            if made != version[k]:  # an entry of before its corner's neighbors changed
                 continue
             line = key(rim[before[k]], rim[after[k]])
             if line not in taken and line not in drawn:
                 break
         else:
-            return None
+            return None  # only edges that exist already are left
         drawn.add(line)
         patch.append((rim[before[k]], rim[k], rim[after[k]]))
         after[before[k]], before[after[k]] = after[k], before[k]

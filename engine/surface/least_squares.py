@@ -48,6 +48,7 @@ def conjugate_gradients(
     before = (rest * step).sum(axis=axis, dtype=np.float64)
     for _ in range(iterations):
         image = apply_matrix(step)
+        # a direction without curvature takes no step
         bent = np.maximum((step * image).sum(axis=axis, dtype=np.float64), 1e-30)
         length = (before / bent).astype(np.float32)
         x, rest = x + length * step, rest - length * image

@@ -45,6 +45,7 @@ def marching_cubes(volume: TsdfVolume, min_weight: float) -> TriangleMesh:
         )
     if max(vertex_counts.sum(), face_counts.sum()) >= 2**31 - 1:
         raise ConfigError("The surface has more than two thousand million parts; choose larger voxels.")
+    # exclusive sums: where each block's elements begin
     vertex_starts = np.cumsum(vertex_counts) - vertex_counts
     face_starts = np.cumsum(face_counts) - face_counts
     first = np.empty(volume.values.shape, np.int32)

@@ -96,7 +96,7 @@ def case_triangles(case: int) -> _Triangles:
     found: _Triangles = []
     for loop in case_loops(case):
         sides = {frozenset((a, b)) for a, b in zip(loop, (*loop[1:], loop[0]), strict=True)}
-        for candidate in _loop_triangulations(loop):
+        for candidate in _loop_triangulations(loop):  # the first that no neighbor can contradict
             lines = {frozenset(pair) for a, b, c in candidate for pair in ((a, b), (b, c), (c, a))}
             if all(not _share_a_face(*line) for line in lines - sides):
                 found += candidate

@@ -85,7 +85,7 @@ def _is_manifold_face(faces: Int32[np.ndarray, "m 3"]) -> Bool[np.ndarray, " m"]
     alone = _is_unique(edges[:, 0] * size + edges[:, 1]).reshape(-1, 3).all(axis=1)
     low, middle, high = np.sort(faces.astype(np.int64), axis=1).T
     distinct = (low < middle) & (middle < high)
-    _, pair = np.unique(low * size + middle, return_inverse=True)
+    _, pair = np.unique(low * size + middle, return_inverse=True)  # exact keys of three corners, by pairs
     result: np.ndarray = alone & distinct & _is_unique(pair.reshape(-1) * size + high)
     return result
 

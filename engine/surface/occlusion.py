@@ -32,6 +32,7 @@ class Occluder:
         """
         way = points_world - viewers_world
         length = np.linalg.norm(way, axis=1)
+        # a point may lie nearer than the tolerance
         reach = np.maximum(length * (1 - OFFSET_RATIO) - tolerance, 0.0)
         directions = way / np.maximum(length, 1e-30)[:, None]
         return ~self._scene.occluded(RayBatch(viewers_world, directions, t_max=reach))

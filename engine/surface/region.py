@@ -92,12 +92,14 @@ def choose_region(maps: DepthMaps, options: ExtractionOptions) -> Region:
             _, distance = focus_point(maps.cameras)
         except ConfigError:
             distance = 0.5 * float((high - low).max())
+        # the size stands in for a distance that is not known
         return _make_grid(low, high, distance, pixel * distance, options)
     centre, distance = focus_point(maps.cameras)
     if not options.unbounded:
         box = _depth_bounds(maps, centre - distance, centre + distance)
         return _make_grid(*box, distance, pixel * distance, options)
     half = np.full(3, CONTRACTED_HALF_SIDE)
+    # voxels are given in world units, the grid is in those of the radius
     voxel = None if options.voxel is None else options.voxel / distance
     grid = _make_grid(-half, half, 1.0, pixel, options.model_copy(update={"voxel": voxel}))
     return replace(grid, contracted=True, centre_world=centre, radius=distance)
@@ -125,7 +127,7 @@ def _depth_bounds(
         raise ConfigError(NO_SURFACE_MESSAGE)
     least, most = np.quantile(points, [OUTLIER_SHARE, 1 - OUTLIER_SHARE], axis=0).astype(np.float64)
     margin = MARGIN_SHARE * float((most - least).max())
-    return np.maximum(low, least - margin), np.minimum(high, most + margin)
+    return np.maximum(low, least - margin), np.minimum(high, most + margin)  # not beyond the cube
 
 
 def focus_point(cameras: Sequence[PinholeCamera]) -> tuple[Float64[np.ndarray, "3"], float]:
@@ -156,6 +158,7 @@ def _make_grid(
     """Return the grid over a box seen from ``distance``, where a pixel is ``pixel`` wide."""
     side = float((high - low).max())
     voxel = options.voxel or max(side / (options.resolution or RESOLUTION), PIXELS_PER_VOXEL * pixel)
+    # rounding must not add a row of blocks
     blocks = np.maximum(1, np.ceil((high - low) / (voxel * BLOCK) - 1e-6)).astype(int)
     if blocks.max() > MAX_BLOCKS_PER_SIDE:
         raise ConfigError(

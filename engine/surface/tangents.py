@@ -27,7 +27,7 @@ def vertex_tangents(mesh: TriangleMesh) -> Float32[np.ndarray, "n 4"]:
     uv = mesh.uv.astype(np.float64)[mesh.faces] * [1, -1]  # v grows upwards from here on
     (ab, ac), (s_ab, s_ac) = (np.moveaxis(of[:, 1:] - of[:, :1], 1, 0) for of in (corners, uv))
     area = s_ab[:, 0] * s_ac[:, 1] - s_ab[:, 1] * s_ac[:, 0]
-    along = ab * s_ac[:, 1:] - ac * s_ab[:, 1:]
+    along = ab * s_ac[:, 1:] - ac * s_ab[:, 1:]  # dP/du times the area in the texture
     side = np.where(area >= 0, 1.0, -1.0)
     along *= side[:, None]
     sums = np.zeros((2, len(normals), 3))
@@ -41,6 +41,7 @@ def vertex_tangents(mesh: TriangleMesh) -> Float32[np.ndarray, "n 4"]:
         )
         angle = np.arccos(np.clip((one * two).sum(axis=1), -1.0, 1.0)) * (area != 0)
         share = angle[:, None] * _normalize_vectors(_perpendicular_part(along, normal))
+        # mirrored triangles apart: averaged with others they would cancel
         for row, sign in enumerate((1.0, -1.0)):
             mine = side == sign
             angles[row] += np.bincount(vertex[mine], angle[mine], len(normals))
@@ -48,7 +49,7 @@ def vertex_tangents(mesh: TriangleMesh) -> Float32[np.ndarray, "n 4"]:
                 sums[row, :, axis] += np.bincount(vertex[mine], share[mine, axis], len(normals))
     mirrored = angles[1] > angles[0]
     tangents = _normalize_vectors(np.where(mirrored[:, None], sums[1], sums[0]))
-    lost = (tangents == 0).all(axis=1)
+    lost = (tangents == 0).all(axis=1)  # no texture area: any direction along the surface
     tangents[lost] = _normalize_vectors(
         np.cross(normals[lost], np.eye(3)[np.argmin(np.abs(normals[lost]), axis=1)])
     )

@@ -84,7 +84,7 @@ def unwrap(mesh: TriangleMesh, side_px: int) -> TextureLayout:
     )
     # xatlas picks a scale at which everything fits about; the image may come out a little larger or smaller.
     normals = mesh.vertex_normals()
-    uv = atlas.uv.astype(np.float64) * atlas.size_px / atlas.size_px.max()
+    uv = atlas.uv.astype(np.float64) * atlas.size_px / atlas.size_px.max()  # in units of the longer side
     cut = TriangleMesh(
         mesh.vertices_world[atlas.origin], atlas.faces.astype(np.int32), uv=uv.astype(np.float32),
         normals_world=normals[atlas.origin],

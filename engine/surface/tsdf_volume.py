@@ -94,7 +94,7 @@ def fuse_depth_maps(
         )
         progress(number + 1, total)
     blocks = np.argwhere(marks).astype(np.int32)
-    _check_size(len(blocks), options)
+    _check_size(len(blocks), options)  # before the memory is taken
     table = np.full(region.blocks, NO_BLOCK, np.int32)
     table[tuple(blocks.T)] = np.arange(len(blocks), dtype=np.int32)
     values = np.zeros((len(blocks), VOXELS_PER_BLOCK), np.float32)
@@ -117,7 +117,7 @@ def fuse_depth_maps(
 def fill_unseen(volume: TsdfVolume, min_weight: float) -> None:
     """Set voxels of less weight than ``min_weight`` to the inside of the surface, in place."""
     unseen = volume.weights < min_weight
-    volume.values[unseen] = -1.0
+    volume.values[unseen] = -1.0  # inside: the surface closes where nobody has looked
     volume.weights[unseen] = min_weight
 
 

@@ -70,7 +70,7 @@ def unwrap_in_process(
             f"{''.join(f', {line}' for line in last)}); choose fewer triangles, or colors at the vertices."
         )
     result = io.BytesIO(done.stdout)
-    return Atlas(*(np.load(result) for _ in Atlas._fields))
+    return Atlas(*(np.load(result) for _ in Atlas._fields))  # arrays in the order of the fields
 
 
 def _unwrap(source: IO[bytes], result: IO[bytes]) -> NoReturn:

@@ -67,9 +67,10 @@ def refine_vertices(
         progress: called with (steps done, total).
     """
     count = len(mesh.vertices_world)
+    # each once, where there are fewer
     taken = np.unique(np.linspace(0, len(pictures) - 1, min(MAX_IMAGES, len(pictures))).astype(int))
     small = [_downsample(*pictures[number]()) for number in taken]
-    rgb = np.full((count, 3), 0.5, np.float32)
+    rgb = np.full((count, 3), 0.5, np.float32)  # gray: the first solve finds the colors
     apart = difference_matrix(VertexPalette(mesh).neighbours, count)
     for step in range(REFINEMENT_STEPS):
         progress(step, REFINEMENT_STEPS)
@@ -91,7 +92,7 @@ def _downsample(
         return np.asarray(cut.reshape(height, side, width, side, -1).mean(axis=(1, 3)))
 
     ways = blocks(rays.directions_world)
-    ways /= np.linalg.norm(ways, axis=2, keepdims=True)
+    ways /= np.linalg.norm(ways, axis=2, keepdims=True)  # means of unit vectors are shorter
     return ImageRays.from_directions(rays.origin_world, ways, float(rays.rays.t_min[0])), blocks(rgba) / 255
 
 
@@ -101,6 +102,7 @@ def _visible_pixels(mesh: TriangleMesh, pictures: Sequence[tuple[ImageRays, np.n
     for rays, rgba in pictures:
         batch: RayBatch = rays.rays
         hits = scene.closest(batch)
+        # a miss beside a hit is a rim
         depth = np.where(hits.is_hit, hits.distances, np.float32(1e6)).reshape(rgba.shape[:2])
         rim = (maximum_filter(depth, 3) > EDGE_THRESHOLD * minimum_filter(depth, 3)).reshape(-1)
         used = np.flatnonzero(hits.is_hit & (rgba[..., 3].reshape(-1) >= MIN_ALPHA))
@@ -114,7 +116,7 @@ def _visible_pixels(mesh: TriangleMesh, pictures: Sequence[tuple[ImageRays, np.n
                 weights=np.concatenate([1 - others.sum(axis=1, keepdims=True), others], axis=1),
                 directions_world=batch.directions_world[used],
                 size_world=(hits.distances[used] * angle).astype(np.float32),
-                steady=~rim[used],
+                steady=~rim[used],  # rims move with the silhouette, not with the surface
                 rgb_srgb=np.clip(pixels[:, :3] / pixels[:, 3:], 0.0, 1.0),
             )
         )
@@ -138,6 +140,7 @@ def _step(
     size = _pixel_sizes(visible, corners, count)
     still = np.zeros_like(visible.weights)
     sure = np.ones(len(corners), np.float32)
+    # --- colors alone, so that the slopes below are those of the present surface ---
     x = _solve_step(
         pixels=_PixelJacobian(corners, visible.weights, still, still),
         wanted_srgb=visible.rgb_srgb,
@@ -156,10 +159,12 @@ def _step(
     )  # fmt: skip
     pixels = _PixelJacobian(corners, visible.weights, lifts, change)
     lacking = visible.rgb_srgb - pixels.apply(_colors_and_displacements(rgb))
+    # Cauchy weights: what disagrees counts little
     sure = (1 / (1 + (lacking**2).sum(axis=1) / OUTLIER_THRESHOLD**2)).astype(np.float32)
     x = _solve_step(
         pixels=pixels, wanted_srgb=visible.rgb_srgb, sure=sure, rgb=rgb, apart=apart, rounds=CG_ITERATIONS
     )
+    # beyond a pixel or two the linearization says nothing
     moved = np.clip(x[:, 3:], -MAX_DISPLACEMENT_PX, MAX_DISPLACEMENT_PX) * size[:, None] * normals
     return replace(mesh, vertices_world=mesh.vertices_world + moved), rgb + x[:, :3]
 
@@ -215,6 +220,7 @@ def _solve_step(
         apart @ now
     )
     diagonal = pixels.diagonal(sure, count) + smooth * apart.diagonal()[:, None] + PRIOR_WEIGHT
+    # colors and displacements depend on each other
     return conjugate_gradients(times, diagonal, lacking, rounds, coupled=True)
 
 

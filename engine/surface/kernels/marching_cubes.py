@@ -47,6 +47,7 @@ def neighbour(
         blocks[b, 2] + z // BLOCK_SIDE,
     )
     place = ((x % BLOCK_SIDE) * BLOCK_SIDE + y % BLOCK_SIDE) * BLOCK_SIDE + z % BLOCK_SIDE
+    # only upwards: cells reach to the next block, never to the one before
     if bx >= table.shape[0] or by >= table.shape[1] or bz >= table.shape[2]:
         return -1, place
     return table[bx, by, bz], place
@@ -87,7 +88,7 @@ def cube_case(near: Float32[np.ndarray, "729"], at: int) -> int:
     for corner in range(8):
         value = near[at + corner_offset(corner)]
         if np.isnan(value):
-            return 0
+            return 0  # no surface where something is unknown
         if value < 0.0:
             case |= 1 << corner
     return case
@@ -179,7 +180,7 @@ def place_triangles(
         number = starts[b]
         for voxel in range(BLOCK_VOXELS):
             x, y, z, at = voxel_place(voxel)
-            if np.isnan(near[at]):
+            if np.isnan(near[at]):  # its cell's first corner is unknown
                 continue
             case = cube_case(near, at)
             for k in range(3 * triangle_counts[case]):
@@ -194,6 +195,7 @@ def place_triangles(
                     y + (low >> 1 & 1),
                     z + (low >> 2 & 1),
                 )
+                # the owner's vertices come in the order of its crossed axes
                 vertex = first[row, place]
                 for before in range(axis):
                     vertex += crossed[row, place] >> before & 1

@@ -21,6 +21,7 @@ def rasterise(
     triangle, get the nearest point of it: bilinear look-ups reach them.
     """
     height, width = owner.shape
+    # centers inside of triangles first, then pixels that one only touches
     for near in range(2):
         reach = 0.75 * near
         for f in range(len(faces)):
@@ -43,6 +44,7 @@ def rasterise(
                     if not (b >= 0.0 and c >= 0.0 and b + c <= 1.0):
                         if near == 0:
                             continue
+                        # the nearest point, about: onto the edges by clamping
                         b, c = max(b, 0.0), max(c, 0.0)
                         if b + c > 1.0:
                             b, c = b / (b + c), c / (b + c)

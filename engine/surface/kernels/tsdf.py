@@ -59,7 +59,7 @@ def contract(x: float, y: float, z: float) -> tuple[float, float, float]:
     length = math.sqrt(x * x + y * y + z * z)
     if length <= 1.0:
         return x, y, z
-    factor = (2.0 - 1.0 / length) / length
+    factor = (2.0 - 1.0 / length) / length  # Eq. 10: (2 - 1/|x|) x/|x|
     return x * factor, y * factor, z * factor
 
 
@@ -74,9 +74,9 @@ def expand(x: float, y: float, z: float) -> tuple[float, float, float, float]:
         return x, y, z, 1.0
     if length >= 1.999:
         return x, y, z, 0.0
-    world = 1.0 / (2.0 - length)
+    world = 1.0 / (2.0 - length)  # the inverse: |x| = 1 / (2 - |y|)
     factor = world / length
-    return x * factor, y * factor, z * factor, world * world
+    return x * factor, y * factor, z * factor, world * world  # d|x|/d|y| = |x|^2
 
 
 @kernel()
@@ -112,6 +112,7 @@ def mark_blocks(
                 px = (centre[0] + wx * distance - middle[0]) / radius
                 py = (centre[1] + wy * distance - middle[1]) / radius
                 pz = (centre[2] + wz * distance - middle[2]) / radius
+                # contraction shrinks radial lengths by |x|^2
                 step *= max(1.0, px * px + py * py + pz * pz)
             # --- points along the ray, half a block apart ---
             reach = truncation * step
@@ -160,7 +161,7 @@ def depth_at(
     a, b = np.float64(distances[y0, x0]), np.float64(distances[y0, x0 + 1])
     c, d = np.float64(distances[y0 + 1, x0]), np.float64(distances[y0 + 1, x0 + 1])
     least, most = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
-    if not (least > 0.0 and most - least <= jump):
+    if not (least > 0.0 and most - least <= jump):  # a zero is an unknown pixel
         return nearest, cosine
     tx, ty = u - 0.5 - x0, v - 0.5 - y0
     return (a * (1 - tx) + b * tx) * (1 - ty) + (c * (1 - tx) + d * tx) * ty, cosine
@@ -202,7 +203,7 @@ def classify_block(
     z = rotation[2, 0] * ox + rotation[2, 1] * oy + rotation[2, 2] * oz
     if z + half <= 0.0:
         return BLOCK_BEHIND
-    if z - half <= 0.1 * half:
+    if z - half <= 0.1 * half:  # the camera is inside or close: no bounds on the image
         return BLOCK_NEAR
     x = rotation[0, 0] * ox + rotation[0, 1] * oy + rotation[0, 2] * oz
     y = rotation[1, 0] * ox + rotation[1, 1] * oy + rotation[1, 2] * oz
@@ -296,7 +297,7 @@ def fuse_view(
                 for k in range(VOXELS_PER_BLOCK):
                     total = weights[b, k] + FREE_WEIGHT
                     values[b, k] += (1.0 - values[b, k]) * (FREE_WEIGHT / total)
-                    weights[b, k] = total
+                    weights[b, k] = total  # running mean
                 continue
         for k in range(VOXELS_PER_BLOCK):
             gx = low[0] + (base_x + k // (BLOCK * BLOCK) + 0.5) * voxel
@@ -328,7 +329,7 @@ def fuse_view(
             if contracted and along < 0.0:
                 band = surface_band(distance / length, (ox, oy, oz), band, centre, grid)
             if along < -band:
-                continue
+                continue  # hidden: nothing is known behind the surface
             value = along * cosine / band
             weight = max(cosine, MIN_WEIGHT)
             if along > band:

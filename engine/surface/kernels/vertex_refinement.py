@@ -46,8 +46,9 @@ def linearise(
             lifts[p, c] = weights[p, c] * sizes[corner] * facing
             change[p, c] = 0.0
         cosine = nx * dx + ny * dy + nz * dz
-        if not steady[p] or abs(cosine) <= MIN_COSINE:
+        if not steady[p] or abs(cosine) <= MIN_COSINE:  # unsteady pixels or oblique ones move nothing
             continue
+        # gradients of the barycentric weights along the ray's direction
         grad_u = ((vy * nz - vz * ny) * dx + (vz * nx - vx * nz) * dy + (vx * ny - vy * nx) * dz) / area
         grad_v = ((ny * uz - nz * uy) * dx + (nz * ux - nx * uz) * dy + (nx * uy - ny * ux) * dz) / area
         for c in range(3):

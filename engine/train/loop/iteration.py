@@ -92,9 +92,8 @@ def loss_and_gradients(
     recorded = [(result.recording, grad_trace), *grad_shading.recorded_traces]
     if batch.visibility_rays is not None:
         recorded.append(free_space_gradient(batch.visibility_rays, tracer, weights.free_space))
-    min_trace_weight = (
-        min_blend_weight if len(recorded) == 1 else 0.0
-    )  # what several say has to be added up first
+    # What several recordings say has to be added up first.
+    min_trace_weight = min_blend_weight if len(recorded) == 1 else 0.0
     gradients = [
         tracer.backward(hits, by, min_blend_weight=min_trace_weight).numpy() for hits, by in recorded
     ]

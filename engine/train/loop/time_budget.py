@@ -70,9 +70,8 @@ def choose_plan(
         gaussians: see there.
         max_gaussians: no more Gaussians than this, as the photographs hold no more down.
     """
-    seconds_unit = (
-        seconds_an_iteration / gaussians**COST_POWER
-    )  # an iteration takes one * count ** COST_POWER
+    # An iteration takes seconds_unit * count ** COST_POWER.
+    seconds_unit = seconds_an_iteration / gaussians**COST_POWER
     gaussian_count = (  # seconds = unit count^p iterations, with iterations in proportion to count
         (seconds / (seconds_unit * ITERATIONS_PER_GAUSSIAN)) ** (1 / (1 + COST_POWER)) if seconds > 0 else 0.0
     )

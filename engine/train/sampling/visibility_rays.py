@@ -80,9 +80,8 @@ class VisibilityRays:
         outer = np.zeros((len(points), 3, 3))
         np.add.at(outer, row, direction[:, :, None] * direction[:, None, :])
         track = np.bincount(row, minlength=len(points))
-        own_cosines = np.einsum(
-            "ki,kij,kj->k", direction, outer[row], direction
-        )  # sum of squared cosines, itself 1
+        # Sum of squared cosines to all rays of the track, itself with 1.
+        own_cosines = np.einsum("ki,kij,kj->k", direction, outer[row], direction)
         # sum of squared sines to the other rays of the track
         sharpness = np.sqrt(np.maximum(track[row] - own_cosines, 1e-12))
         pixel_rad = np.array([dataset.cameras[each.camera_index].pixel_angle_rad for each in dataset.views])[
