@@ -173,6 +173,7 @@ class Operation(Generic[RequestT, ResultT_co]):
             OctasplatError: as ``run`` does.
         """
         groups = request_groups(self.name, request)
+        # kernels compile while the request still reads its input
         with report_compilation(progress), compile_beside(groups):
             return self.run(request, progress=progress, should_stop=should_stop, threads=threads)
 

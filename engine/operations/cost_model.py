@@ -303,7 +303,7 @@ def _held_out(options: ReconstructionConfig, count: int) -> int:
 
 
 def _expected_gaussians(train: TrainConfig, trained_on: int) -> int:
-    most = max_gaussian_count(train, trained_on)
+    most = max_gaussian_count(train, trained_on)  # as many as allowed: most trainings grow up to the cap
     return min(most, _PAPER_GAUSSIANS) if train.densify.kind == "redisplats" else most
 
 

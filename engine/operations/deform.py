@@ -139,7 +139,7 @@ def run(
 def _make_proxy(request: DeformRequest, rest: ImportedMesh) -> "Proxy":
     from octasplat.engine.edit.proxy import Proxy
 
-    mirrored = {"auto": None, "yes": True, "no": False}[request.mirrored]
+    mirrored = {"auto": None, "yes": True, "no": False}[request.mirrored]  # None: the deformed mesh shows it
     try:
         return Proxy(_rotate_mesh(rest, request.axes), rest.triangles, mirrored)
     except SceneFileError as error:

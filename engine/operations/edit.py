@@ -85,7 +85,7 @@ def run(
             recovery = recovery.model_copy(update={"axes": report.axes})
             _warn_about_axes(path, report, progress)
         _warn_about_torn(report, progress)
-        stop_if(should_stop)
+        stop_if(should_stop)  # between two scenes of a sequence: what is written is whole
         notes += [*_report_text(path, report), frames.write(number, result, progress, note)]
         reports.append(report)
         frames.report(number, progress)

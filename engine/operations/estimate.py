@@ -91,7 +91,7 @@ def run(
     from octasplat.engine.dataset.video_frames import is_video, planned_frames
     from octasplat.engine.poses.photographs import locate_scene, notes_on_files
 
-    config, cores = request.config(), request.cores or threads
+    config, cores = request.config(), request.cores or threads  # 0 of both: the cores of this machine
     if is_video(request.source):
         frames = planned_frames(request.source, request.frames_per_second)
         # a video has no model: poses are found

@@ -223,6 +223,7 @@ def run_config(request: ReconstructRequest) -> "ReconstructionConfig":
 
     # with options the request's configuration counts, and is checked against the run's
     given = request.model_fields_set - {"source", "output", "resume", "exports", "frames_per_second"}
+    # empty ones say nothing, whoever filled them in
     given -= {name for name in ("train", "assignments") if not getattr(request, name)}
     if not request.resume or given or not (request.output / _CONFIG).exists():
         return request.config()

@@ -80,7 +80,7 @@ class RelightOptions(PictureOptions):
     @property
     def is_single(self) -> bool:
         """Return whether there is one image, whatever the scene."""
-        return super().is_single and len(self.environments) == 1
+        return super().is_single and len(self.environments) == 1  # several environments need a folder each
 
     @property
     def rays_across(self) -> int:

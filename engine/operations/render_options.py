@@ -148,6 +148,7 @@ class PictureOptions(Options):
     @property
     def frame_rate(self) -> float:
         """Return the images per second."""
+        # a path file says how fast it is shown
         if self.fps is None and self.mode == "path" and self.camera_path is not None:
             return self.camera_path.fps
         return self.fps or DEFAULT_FPS
@@ -191,11 +192,12 @@ class PictureOptions(Options):
             )
         if self.mode == "camera" and self.format == "mp4":
             raise ValueError("there is one image; choose the format png or exr (name a folder or an image)")
+        # a default cannot be told from the same number given
         if self.seconds is not None and self.frames != type(self).model_fields["frames"].default:
             raise ValueError("choose one of `frames` and `seconds`")
         if self.seconds is not None and self.frame_count > MAX_FRAMES:
             raise ValueError(f"`seconds` and `fps` make more than {MAX_FRAMES:,} images")
-        if getattr(self, "background", None) == "transparent" and self.format == "mp4":
+        if getattr(self, "background", None) == "transparent" and self.format == "mp4":  # subclasses have it
             raise ValueError("a video has no alpha; choose images (name a folder), or another background")
         return self
 
@@ -232,9 +234,11 @@ class PictureRequest(PictureOptions, WritingRequest):
     @model_validator(mode="before")
     @classmethod
     def _complete_values(cls, values: Any) -> Any:
+        # refused by the fields themselves
         if not isinstance(values, dict) or "output" not in values or "source" not in values:
             return values
         given = renamed_settings.replace_former_names((cls,), values)
+        # None stands for what was not given, so that the defaults below apply
         given = {name: value for name, value in given.items() if value is not None}
         if "path_file" in given and "camera_path" not in given:
             given["camera_path"] = read_path_document(Path(given["path_file"]))
@@ -253,6 +257,7 @@ class PictureRequest(PictureOptions, WritingRequest):
             raise ValueError("choose one of views, a turntable, a camera path and a single camera")
         if found:
             return found.pop()
+        # imported late: numba and scipy come with it
         from octasplat.engine.runs.run_folder import is_run
 
         return "views" if is_run(Path(given["source"])) else "turntable"
@@ -268,7 +273,7 @@ class PictureRequest(PictureOptions, WritingRequest):
             raise ValueError("the format EXR and the name of a .png contradict each other")
         if suffix == ".exr" and self.format == "png":
             raise ValueError("the format PNG and the name of an .exr contradict each other")
-        several = self.mode == "turntable" and not self.is_single
+        several = self.mode == "turntable" and not self.is_single  # one frame needs no pattern
         if several and self._needs_pattern and not has_number_pattern(self.output):
             raise ValueError(f"{self.output} names one image; write a pattern such as frame_%04d{suffix}")
         if self.mode == "views" and not self._has_views:

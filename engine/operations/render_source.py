@@ -135,6 +135,7 @@ def read_render_source(
                     "in a given light."
                 )
             )
+        # a file says nothing else of its training
         settings = TraceSettings(flip_normal_cos=facts.turned_beyond)
         return RenderSource(
             gaussians,
@@ -149,6 +150,7 @@ def read_render_source(
             f"{source} holds no {SCENE} yet; finish the run with octasplat reconstruct --resume."
         )
     viewpoints = run_viewpoints(source, scene=dataset, max_side=max_side)
+    # pixels of stages count at full size
     photographs = run_viewpoints(source, scene=dataset, max_side=ANY_SIDE_PX) if full_size else None
     gaussians = read_gaussian_ply(source / SCENE)[0]
     options = shown_options(config.train, gaussians)

@@ -51,6 +51,7 @@ def inspect_scene(scene: StageScene, up_world: Float64[np.ndarray, "3"] | None) 
         image = camera.rays()
     else:
         image = photograph_cameras(scene.photographs, np.array([0]), PICTURE_SIDE_PX)[0].rays()
+    # one small picture is not worth compiling the packets' kernels
     tracer = make_tracer(scene.settings, threads=scene.threads, is_used_once=True)
     tracer.build(scene.gaussians)
     picture = render_rays(tracer, image, scene.background_srgb)

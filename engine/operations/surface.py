@@ -257,9 +257,10 @@ def run(
     if request.materials:
         require_materials(gaussians, source / SCENE if is_run(source) else source)
         features, frame = material_features(gaussians), environment_frame(light_up(source, request.up))
-        light = _light_to_copy(source, output)
+        light = _light_to_copy(source, output)  # refused before the long work if another one lies there
     cameras, settings = depth_cameras(source, request.dataset, gaussians, request.depth_side)
     try:
+        # the depth maps' file goes there, long before the surface
         output.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{output.parent} cannot be made ({error.strerror or error}).") from None

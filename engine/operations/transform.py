@@ -125,6 +125,7 @@ def run(
     scene_io.check_edited_output("transform", request, request.output, [request.matrix])
     matrix = request.world_map()
     scene, facts = scene_io.open_scene(source, progress), read_metadata(source)
+    # of a scene far from the world's origin positions need another local one
     origin = origin_after(matrix, scene.means_world, facts.origin_world)
     local = local_map(matrix, facts.origin_world, origin)
     moved = transform_gaussians(scene, local)
