@@ -171,7 +171,7 @@ def estimate_reconstruction(
     found = _make_estimate(
         cpu_seconds, memory, cores, finds_poses=finds_poses, disk_bytes=disk, stages=stages
     )
-    share = sum(search.values()) / cpu_seconds  # of the clock's time, which several cores shorten
+    share = sum(search.values()) / cpu_seconds
     return found.model_copy(update={"poses_seconds": round(share * found.seconds, 1)})
 
 
@@ -322,7 +322,7 @@ def _gaussian_bytes(sh_degree: int) -> int:
     """Return the bytes per Gaussian: float32 parameters, gradients, two moments and mean, and hierarchy.
 
     789 for degree 2 were measured before there was that mean, which adds 148.
-    """  # bytes: float32 parameters, gradients, two moments and mean are 20 a number
+    """
     return 197 + 20 * (10 + 3 * (sh_degree + 1) ** 2)
 
 

@@ -117,5 +117,6 @@ def _weighted_quantile(
     values: Float64[np.ndarray, " n"], weights: Float64[np.ndarray, " n"], quantile: float
 ) -> float:
     order = np.argsort(values)
-    sums = np.cumsum(weights[order])  # beyond the sums by rounding: the last value
+    sums = np.cumsum(weights[order])
+    # Rounding may put the quantile beyond the last sum.
     return float(values[order[min(int(np.searchsorted(sums, quantile * sums[-1])), len(order) - 1)]])

@@ -33,7 +33,7 @@ def rough_dielectric_eval(
     length = math.sqrt(h_x * h_x + h_y * h_y + h_z * h_z)
     if length < 1e-9:
         return 0.0, 0.0
-    if h_z < 0.0:  # on the viewer's side
+    if h_z < 0.0:  # turned to the viewer's side
         length = -length
     h_x, h_y, h_z = h_x / length, h_y / length, h_z / length
     cos_o = o_x * h_x + o_y * h_y + o_z * h_z

@@ -115,7 +115,7 @@ def _trace_glass(
                 and materials.roughness[m] >= MIN_GLASS_ROUGHNESS
                 and materials.iors[m] != 1.0
             ):
-                reflectance = 0.0  # goes on by paths from its own surface
+                reflectance = 0.0  # rough glass passes light on by paths from its own surface
             t = scratch.distances[i]
             # Out of the glass: what it absorbed on the way.
             length = float(t - scratch.t_starts[place]) if cosine > 0.0 else 0.0
