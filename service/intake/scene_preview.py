@@ -142,6 +142,7 @@ class _ArchiveEnd(io.BytesIO):
 
     def seek(self, position: int, whence: int = io.SEEK_SET, /) -> int:
         """Move to a position of the whole file; it must lie in the part that is there."""
+        # Counted from the end, places are the same as in the whole.
         if whence == io.SEEK_END:
             return super().seek(position, whence) + self._start
         if position < self._start:

@@ -93,6 +93,7 @@ async def get_upload(
     _check_version(version)
     upload = await actions.get_upload(service, principal, dataset_id, upload_id)
     response.headers.update(_headers(upload))
+    # tus asks for this, as an offset that a cache remembers is out of date.
     response.headers["Cache-Control"] = "no-store"
     return UploadView.from_row(upload)
 
@@ -157,6 +158,7 @@ def _check_version(version: str | None) -> None:
     Raises:
         ProblemError: 412.
     """
+    # Clients that are generated from the document leave the header out.
     if version is not None and version != VERSION:
         detail = f"Uploads are those of tus {VERSION}."
         raise ProblemError(412, "tus-version", detail, headers={"Tus-Version": VERSION})

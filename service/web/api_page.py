@@ -90,6 +90,7 @@ def _api_operation(method: str, path: str, operation: Mapping[str, Any]) -> ApiO
                 parameter.get("required", False),
             )
             for parameter in operation.get("parameters", ())
+            # Browsers send it by themselves.
             if parameter["in"] != "cookie"
         ],
         body=list(operation.get("requestBody", {}).get("content", {})),

@@ -167,6 +167,7 @@ def _with_first_sentence(progress: EventListener, first_sentence: Callable[[], s
 
     def listen(event: Event) -> None:
         nonlocal is_open
+        # The frames of a video are chosen first; before that there are no photographs to estimate by.
         if isinstance(event, PhaseStarted) and event.stage != "frames" and not is_open:
             is_open = True
             if (sentence := first_sentence()) is not None:

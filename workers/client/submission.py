@@ -165,6 +165,7 @@ def derive(api: Api, derivation: Derivation, on_event: EventListener = ignore_ev
         ServiceError: something is refused.
         ServiceUnreachableError: the service does not answer.
     """
+    # Before anything is sent.
     for path in derivation.files.values():
         if not path.is_file():
             raise ConfigError(f"{path}: there is no such file.")

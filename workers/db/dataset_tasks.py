@@ -144,6 +144,7 @@ async def claim_task(connection: Connection, kind: TaskKind, *, max_per_owner: i
         kind: of task.
         max_per_owner: how many of one owner are worked on at once.
     """
+    # In one statement, in which front ends that ask at once skip the row that another one has.
     return await fetch_one(
         connection,
         DatasetTask,

@@ -204,6 +204,7 @@ class Attempt:
                 await _replace_artifacts(connection, job, results)
                 await check_bytes(connection, job.owner, self.quota)
             await end_job(connection, job, "failed", self.redact(dict(error)))
+            # Collected soon, like contents that were replaced.
             await connection.execute(
                 "INSERT INTO replaced_contents (sha256) SELECT unnest(%s::text[]) ON CONFLICT DO NOTHING",
                 [sorted(_result_digests(discarded))],
@@ -227,6 +228,7 @@ class Attempt:
             if job.state == "canceling":
                 await end_job(connection, job, "canceled", None)
                 return
+            # In the form that the events keep, by which it is counted.
             reason = storable_text(self.redact(reason))
             if max_uncounted is not None and await _count_requeues(connection, job, reason) >= max_uncounted:
                 error = {"type": "worker_failed", "message": f"Handed back too often: {reason}."}
@@ -262,6 +264,7 @@ class Attempt:
             StorageUnavailableError: as by :meth:`fail`.
             QuotaExceededError: as by :meth:`fail`.
         """
+        # Both change what the owner stores, for which the owner's lock is taken first.
         counts = drop_checkpoint or bool(results)
         async with self._fenced_transaction(lease, _result_digests(results), changes_usage=counts) as (
             connection,

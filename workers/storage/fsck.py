@@ -109,6 +109,7 @@ def compare_with_storage(
             finding for place in places if (finding := _check_reference(place, sizes)) is not None
         ]
     if verify:
+        # What is missing is told already, so that only what is there is read.
         _verify(storage, {sha256: named[sha256] for sha256 in named if sha256 in sizes}, report, on_blob)
     return report
 

@@ -85,6 +85,7 @@ class S3Storage(S3Bucket):
     def delete(self, sha256: str) -> bool:
         """Remove a blob; see the protocol."""
         try:
+            # S3 answers a deletion in the same way whether or not there was an object.
             self.stat(sha256)
         except BlobNotFoundError:
             return False
@@ -128,6 +129,7 @@ class S3Storage(S3Bucket):
                         break
                     if error_code(error) not in _BUSY_CODES or pause is None:
                         raise
+                    # Another request for the same key is under way.
                     time.sleep(pause)
         # A repeated request after a lost answer meets its own document.
         return self.read_document(name) == document

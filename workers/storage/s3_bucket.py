@@ -77,6 +77,7 @@ class S3Bucket:
 
     def read_chunks(self, sha256: str, start: int, stop: int) -> Iterator[bytes]:
         """Yield the bytes ``start`` to ``stop`` of a blob in pieces."""
+        # A range of HTTP has one byte at least.
         if start >= stop:
             return
         with self.translate_errors(sha256):

@@ -73,10 +73,12 @@ def store_tree(
     known = NameSet()
     files: list[TreeFile] = []
     with UntrustedFolder(folder) as source:
+        # Sorted, so that equal folders give equal manifests.
         for name in sorted(source.names(below) if names is None else names):
             known.add(name)
             inner = f"{below}/{name}" if below else name
             with (
+                # By the descriptor that was checked, whatever the name stands for by then.
                 source.open(inner) as handle,
                 translate_os_errors(folder / inner),
                 storage.open_writer() as writer,
@@ -106,6 +108,7 @@ def fetch_tree(storage: Storage, files: Iterable[TreeFile], folder: Path, *, wri
     """
     files = tuple(files)
     known = NameSet()
+    # All names are judged before the first file is written.
     for file in files:
         known.add(file.path)
     with translate_os_errors(folder):

@@ -95,6 +95,7 @@ def _database_connection(settings: "WorkerSettings", *, exclusive: bool = False)
         return
     with lock_data_folder(settings.data) if exclusive else contextlib.nullcontext():
         database = EmbeddedPostgres(settings.data.absolute())
+        # A database that runs already is left running.
         ran = database.is_running()
         conninfo = database.start()
         try:

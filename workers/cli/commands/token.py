@@ -95,6 +95,7 @@ def revoke(token_id: uuid.UUID, data: Path | None, printer: Printer) -> None:
     from octasplat.workers.db.tokens import revoke_token
 
     async def shut(connection: "Connection") -> bool:
+        # In the same transaction, so that no change stays out of the audit.
         await _add_audit_entry(connection, "token revoke", f"/v1/tokens/{token_id}")
         return await revoke_token(connection, token_id)
 

@@ -88,6 +88,7 @@ async def lease_due(
         with_endpoints = [
             (delivery, await get_webhook_endpoint(connection, delivery.endpoint_id)) for delivery in taken
         ]
+    # An endpoint may have been deleted after its messages were leased.
     return [(delivery, endpoint) for delivery, endpoint in with_endpoints if endpoint is not None]
 
 
