@@ -9,10 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import psycopg
 import pytest
 
 from octasplat.service.state import Service
+from octasplat.workers.db.migrate import OWN_COMPONENT, all_migrations, migrate
+from octasplat.workers.maintenance.backup import create_backup, restore_backup
 from octasplat.workers.queue.attempts import ResultFile
+from octasplat.workers.storage.local import LocalStorage
 from tests.support.model_builder import photograph
 from tests.support.postgres_fixtures import EmbeddedPostgres, copied_database
 from tests.support.service_harness import (
@@ -21,6 +25,7 @@ from tests.support.service_harness import (
     committed_dataset,
     running_service,
     store_content,
+    task_over,
 )
 from tests.support.worker_harness import WorkerHarness
 
@@ -104,6 +109,63 @@ async def test_restored_service_continues_jobs(
         async with running_service(elsewhere, there) as (http, service):
             await after(http, service)
         await asyncio.to_thread(finish_jobs, WorkerHarness(elsewhere, there), made["jobs"][1:])
+
+
+async def test_upload_goes_on_where_it_is_restored(
+    conninfo: str, postgres: EmbeddedPostgres, template: str, tmp_path: Path
+) -> None:
+    backup, here, there = tmp_path / "backup", tmp_path / "here", tmp_path / "there"
+    content = photograph()
+    headers = {"Upload-Length": str(len(content)), "Upload-Metadata": "path aW1hZ2VzL2EucG5n"}
+    part = {"Content-Type": "application/offset+octet-stream"}
+    async with running_service(conninfo, here) as (http, _):
+        dataset = (await http.post("/v1/datasets", json={"name": "d"})).headers["Location"]
+        upload = (await http.post(f"{dataset}/uploads", headers=headers)).headers["Location"]
+        sent = await http.patch(upload, content=content[:20], headers={**part, "Upload-Offset": "0"})
+        assert sent.status_code == 204
+        saved = await asyncio.to_thread(octasplat, conninfo, here, "backup", backup)
+        assert saved.returncode == 0, saved.stderr
+    with copied_database(postgres, "template1") as elsewhere:
+        restored = octasplat(elsewhere, there, "restore", backup)
+        assert restored.returncode == 0, restored.stderr
+        async with running_service(elsewhere, there, has_token=False) as (http, _):
+            rest = await http.patch(upload, content=content[20:], headers={**part, "Upload-Offset": "20"})
+            assert rest.status_code == 204, rest.text
+            answer = httpx.Response(202, headers={"Location": rest.headers["Location"]})
+            assert (await task_over(http, answer))["state"] == "succeeded"
+            assert (await http.get(f"{dataset}/files/images/a.png")).content == content
+
+
+def test_backup_of_an_earlier_version_is_restored(postgres: EmbeddedPostgres, tmp_path: Path) -> None:
+    backup, steps = tmp_path / "backup", [
+        step.name for step in all_migrations() if step.component == OWN_COMPONENT and step.name < "0016"
+    ]  # fmt: skip
+    owner, content = "me", b"a photograph"
+    store = LocalStorage(tmp_path / "here", floor_bytes=0)
+    with store.open_writer() as writer:
+        writer.write(content)
+        blob = writer.commit()
+    with copied_database(postgres, "template1") as before:
+        migrate(before, only=steps)
+        with psycopg.connect(before) as connection:
+            made = connection.execute(
+                "INSERT INTO datasets (id, owner, name) VALUES (gen_random_uuid(), %s, 'd') RETURNING id",
+                [owner],
+            ).fetchone()
+            assert made is not None
+            connection.execute(
+                "INSERT INTO dataset_files (dataset_id, path, sha256, size_bytes, facts) "
+                "VALUES (%s, 'images/a.png', %s, %s, '{}')",
+                [made[0], blob.sha256, blob.size_bytes],
+            )
+        assert create_backup(before, store, backup).contents == 1
+    with copied_database(postgres, "template1") as elsewhere:
+        there = LocalStorage(tmp_path / "there", floor_bytes=0)
+        assert restore_backup(elsewhere, there, backup).contents == 1
+        with psycopg.connect(elsewhere) as connection:
+            assert connection.execute("SELECT bytes FROM owner_usage WHERE bytes > 0").fetchall() == [(12,)]
+        with there.open(blob.sha256) as file:
+            assert file.read() == content
 
 
 @pytest.mark.parametrize("folder", ["nothing", "other"])

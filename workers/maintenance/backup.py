@@ -13,10 +13,10 @@ import json
 import os
 import shutil
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, LiteralString
 
 import psycopg
 from psycopg import sql
@@ -35,28 +35,24 @@ FORMAT = 1
 BACKUP_FILE, TABLES_PREFIX, STORE_FOLDER = "backup.json", "tables-", "store"
 # What migrate writes by itself, and what processes write that do not run where it is restored.
 _EXCLUDED_TABLES = ("schema_steps", "schema_reach", "workers", "storing", "removing_contents")
-_CONTENTS_QUERY = """
-    SELECT sha256 FROM dataset_files UNION SELECT sha256 FROM artifacts
-    UNION SELECT file->>'sha256' FROM jobs, jsonb_array_elements(checkpoint->'files') AS file
-    UNION SELECT preview->>'sha256' FROM jobs WHERE preview ? 'sha256'
-    UNION SELECT sha256 FROM live_scenes UNION SELECT views_sha256 FROM live_scenes
-"""
-
-
-_PLACES_QUERY = """
-    SELECT 'The file ' || path || ' of the dataset ' || dataset_id FROM dataset_files
-    WHERE sha256 = %(sha256)s
-    UNION ALL
-    SELECT 'The result ' || name || ' of the job ' || job_id FROM artifacts WHERE sha256 = %(sha256)s
-    UNION ALL
-    SELECT 'The checkpoint of the job ' || id FROM jobs, jsonb_array_elements(checkpoint->'files') AS file
-    WHERE file->>'sha256' = %(sha256)s
-    UNION ALL
-    SELECT 'The preview of the job ' || id FROM jobs WHERE preview->>'sha256' = %(sha256)s
-    UNION ALL
-    SELECT 'The live scene of the job ' || job_id FROM live_scenes
-    WHERE %(sha256)s IN (sha256, views_sha256) LIMIT 1
-"""
+_REFERENCES: Mapping[str, LiteralString] = {
+    "dataset_files": """
+        SELECT sha256, 'The file ' || path || ' of the dataset ' || dataset_id FROM dataset_files
+        """,
+    "upload_parts": "SELECT sha256, 'A part of the upload ' || upload_id FROM upload_parts",
+    "artifacts": "SELECT sha256, 'The result ' || name || ' of the job ' || job_id FROM artifacts",
+    "jobs": """
+        SELECT file->>'sha256', 'The checkpoint of the job ' || id
+        FROM jobs, jsonb_array_elements(checkpoint->'files') AS file
+        UNION ALL
+        SELECT preview->>'sha256', 'The preview of the job ' || id FROM jobs WHERE preview ? 'sha256'
+        """,
+    "live_scenes": """
+        SELECT content, 'The live scene of the job ' || job_id
+        FROM live_scenes, unnest(ARRAY[sha256, views_sha256]) AS content
+        """,
+}
+"""By table, what selects the digests of contents that its rows name, and what to call the place."""
 
 
 class BackupError(OctasplatError):
@@ -128,7 +124,7 @@ def create_backup(
                 "SELECT sequencename, last_value FROM pg_sequences "
                 "WHERE schemaname = current_schema() AND last_value IS NOT NULL"
             ).fetchall())  # fmt: skip
-            referenced = {sha256 for (sha256,) in connection.execute(_CONTENTS_QUERY)}
+            referenced = _referenced_contents(connection)
             jobs = {str(job_id) for (job_id,) in connection.execute("SELECT id FROM jobs")}
         copy = LocalStorage(folder / STORE_FOLDER, floor_bytes=0)
         copied = _copy_store(storage, copy, referenced, jobs, on_content)
@@ -186,7 +182,7 @@ def restore_backup(
         # Nobody works on them here.
         connection.execute("UPDATE jobs SET state = 'queued', worker = NULL WHERE state = 'running'")
         connection.execute("UPDATE jobs SET state = 'canceled', slip = NULL WHERE state = 'canceling'")
-        missing = {sha256 for (sha256,) in connection.execute(_CONTENTS_QUERY)} - listed
+        missing = _referenced_contents(connection) - listed
         missing -= set(record.get("lacks", ()))  # of which was told when it was made
         if missing:
             raise BackupError(
@@ -320,9 +316,25 @@ def _copy_content(source: Storage, target: Storage, sha256: str) -> int:
     return blob.size_bytes
 
 
+def _referenced_contents(connection: psycopg.Connection) -> set[str]:
+    query = sql.SQL("SELECT DISTINCT sha256 FROM ({}) AS named (sha256, place)")
+    return {sha256 for (sha256,) in connection.execute(query.format(_references(connection)))}
+
+
+def _references(connection: psycopg.Connection) -> sql.Composed:
+    """Return the query of :data:`_REFERENCES` for the tables that are there; an earlier version has fewer."""
+    there = {name for (name,) in connection.execute(
+        "SELECT tablename FROM pg_tables WHERE schemaname = current_schema()"
+    )}  # fmt: skip
+    return sql.SQL(" UNION ALL ").join(
+        sql.SQL(query) for table, query in _REFERENCES.items() if table in there
+    )
+
+
 def _name_content(connection: psycopg.Connection, sha256: str, fault: str) -> str:
     """Return a sentence on a content that is ``damaged`` or ``missing``, with a place that names it."""
-    row = connection.execute(_PLACES_QUERY, {"sha256": sha256}).fetchone()
+    query = sql.SQL("SELECT place FROM ({}) AS named (sha256, place) WHERE sha256 = %s LIMIT 1")
+    row = connection.execute(query.format(_references(connection)), [sha256]).fetchone()
     return f"{row[0] if row is not None else 'A content'} is {fault} in the store ({sha256})."
 
 
