@@ -108,7 +108,9 @@ def point_triangle_distances(
     # Barycentric coordinates of the foot of the perpendicular.
     foot_b = np.sum(np.cross(offset, c - a) * normal, axis=1) / squared
     foot_c = np.sum(np.cross(b - a, offset) * normal, axis=1) / squared
-    inside = (foot_b >= 0) & (foot_c >= 0) & (foot_b + foot_c <= 1)
+    # Without area there is no plane, and every point would lie on it.
+    has_plane = np.sum(normal * normal, axis=1) > 1e-300
+    inside = has_plane & (foot_b >= 0) & (foot_c >= 0) & (foot_b + foot_c <= 1)
     to_plane = np.abs(height) / np.sqrt(squared)
     to_rim = np.minimum.reduce(
         [_to_segment(points, a, b), _to_segment(points, b, c), _to_segment(points, c, a)]

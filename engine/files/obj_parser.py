@@ -41,17 +41,18 @@ class ObjParts:
 
 
 def read_blocks(handle: IO[bytes]) -> Iterator[bytes]:
-    """Yield the file in blocks that end at the end of a line."""
+    """Yield the file in blocks that end at the end of a line, with the lines that go on after a backslash."""
     rest = handle.read(len(codecs.BOM_UTF8)).removeprefix(codecs.BOM_UTF8)
     while chunk := handle.read(BLOCK_BYTES):
-        complete, newline, tail = chunk.rpartition(b"\n")
-        if newline:
-            yield rest + complete + newline
-            rest = tail
-        else:
-            rest += chunk
-            if len(rest) > MAX_LINE_BYTES:
-                raise SceneFileError(f"{handle.name}: has a line of more than {MAX_LINE_BYTES >> 20} MiB.")
+        data = rest + chunk
+        end = data.rfind(b"\n")
+        while end >= 0 and data[max(0, end - 2) : end].removesuffix(b"\r").endswith(b"\\"):
+            end = data.rfind(b"\n", 0, end)
+        if end >= 0:
+            yield data[: end + 1]
+        rest = data[end + 1 :]
+        if len(rest) > MAX_LINE_BYTES:
+            raise SceneFileError(f"{handle.name}: has a line of more than {MAX_LINE_BYTES >> 20} MiB.")
     if rest:
         yield rest + b"\n"
 
@@ -176,7 +177,11 @@ def _parse_faces(path: Path, text: bytes, before: Int64[np.ndarray, "f 2"], part
     if uniform and b"//" not in text:
         per_word = 1 + next(iter(slashes))
         values = _parse_number_rows(path, text.replace(b"/", b" ").translate(None, b"f"), lines, "f")
-        if values.shape[1] == words_per_line * per_word and not _is_ragged(text, words_per_line + 1):
+        if (
+            words_per_line >= 3
+            and values.shape[1] == words_per_line * per_word
+            and not _is_ragged(text, words_per_line + 1)
+        ):
             indices = values.astype(np.int64).reshape(lines, words_per_line, per_word)
             _add_fans(indices[:, :, 0], indices[:, :, 1] if per_word > 1 else None, before, parts)
             return

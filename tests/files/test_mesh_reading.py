@@ -226,3 +226,20 @@ def test_ply_of_gaussians_is_no_mesh(tmp_path: Path) -> None:
 def test_mesh_unknown_suffix_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SceneFileError, match=r"save it as \.glb, \.ply or \.obj"):
         read_mesh(tmp_path / "mesh.fbx")
+
+
+@pytest.mark.parametrize("line_end", ["\n", "\r\n"])
+@pytest.mark.parametrize("block", range(8, 40))
+def test_obj_lines_that_go_on_are_joined_at_the_end_of_a_block(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line_end: str, block: int
+) -> None:
+    monkeypatch.setattr(obj_parser, "BLOCK_BYTES", block)
+    text = "v 0 0 0\nv 1 0 \\\n0\nv 0 1 0\nf 1 2 \\\n\\\n3\nf 3 2 1\n"
+    mesh = read_mesh(obj(tmp_path, text.replace("\n", line_end)))
+    assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+    assert mesh.triangles.tolist() == [[0, 1, 2], [2, 1, 0]]
+
+
+def test_obj_of_lines_of_two_corners_has_no_triangles(tmp_path: Path) -> None:
+    mesh = read_mesh(obj(tmp_path, "v 0 0 0\nv 1 0 0\nf 1 2\nf 2 1\n"))
+    assert len(mesh.triangles) == 0

@@ -30,6 +30,12 @@ def test_distance_to_each_part_of_a_triangle():
     np.testing.assert_allclose(found, [distance for _, distance in cases])
 
 
+def test_distance_to_triangle_without_area_is_that_to_its_line() -> None:
+    line = np.array([[[0.0, 0, 0], [1, 0, 0], [2, 0, 0]], [[1.0, 1, 1]] * 3])
+    found = point_triangle_distances(np.array([[1.0, 3, 4], [1, 1, 3]]), line)
+    np.testing.assert_allclose(found, [5.0, 2.0])
+
+
 def test_samples_are_uniform_over_the_area(sheet):
     points, faces = sample_surface(sheet, 40_000, np.random.default_rng(0))
     np.testing.assert_allclose(points.mean(axis=0), [0.5, 0.5, 0], atol=0.01)
