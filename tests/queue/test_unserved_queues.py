@@ -4,6 +4,7 @@ import asyncio
 from functools import partial
 
 from octasplat.workers.db.connections import open_pool
+from octasplat.workers.db.holds import set_queue_paused
 from octasplat.workers.db.ids import new_id
 from octasplat.workers.db.workers import record_worker_heartbeat
 from octasplat.workers.queue.attempts import claim
@@ -71,3 +72,18 @@ async def test_workers_may_come_back_after_all_was_switched_off(conninfo: str) -
         async with pool.connection() as connection:
             job = await get_job(connection, served.id)
         assert job is not None and job.state == "queued"
+
+
+async def test_jobs_of_paused_queues_wait_however_long(conninfo: str) -> None:
+    async with open_pool(conninfo, max_size=4) as pool:
+        async with pool.connection() as connection:
+            job = await create_job(connection, SLIPS, NewJob("me", "toy", {}, "lagre"))
+            await connection.execute("UPDATE jobs SET queued_at = now() - interval '4 days'")
+            await set_queue_paused(connection, "lagre", True)
+        end = partial(
+            fail_abandoned_jobs, pool, SLIPS, stale_seconds=20, hours=72, suspects=StalledAttempts(0)
+        )
+        assert await end() == []
+        async with pool.connection() as connection:
+            await set_queue_paused(connection, "lagre", False)
+        assert await end() == [job.id]

@@ -41,6 +41,8 @@ async def fail_abandoned_jobs(
 ) -> list[uuid.UUID]:
     """Fail jobs that have waited for ``hours`` in a queue that no worker has taken for as long.
 
+    Those of a paused queue wait for whoever has paused it, who may have ended the workers as well.
+
     Args:
         pool: connections.
         job_queue: the queue.
@@ -60,6 +62,7 @@ async def fail_abandoned_jobs(
                 """
             SELECT {} FROM jobs WHERE state = 'queued'
               AND queued_at < now() - make_interval(secs => %(limit)s)
+              AND NOT EXISTS (SELECT 1 FROM paused_queues WHERE paused_queues.queue = jobs.queue)
               AND NOT EXISTS (
                 SELECT 1 FROM workers WHERE jobs.queue = ANY(workers.queues)
                   AND seen_at > now() - make_interval(secs => %(stale)s)
