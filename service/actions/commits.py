@@ -1,6 +1,7 @@
 """Commits of datasets: tasks that validate the files and close the dataset for good."""
 
 import asyncio
+import logging
 import uuid
 from contextlib import suppress
 from dataclasses import asdict
@@ -16,7 +17,7 @@ from octasplat.service.auth import Principal
 from octasplat.service.intake.dataset import DatasetFile as IntakeFile
 from octasplat.service.intake.dataset import DatasetSummary, check_dataset
 from octasplat.service.intake.input_files import check_input_files
-from octasplat.service.problems import problem_from_error
+from octasplat.service.problems import problem_from_error, unexpected_problem
 from octasplat.service.state import Service
 from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
 from octasplat.workers.db import datasets as rows
@@ -25,6 +26,8 @@ from octasplat.workers.db.dataset_tasks import DatasetTask, tasks_of
 from octasplat.workers.db.errors import ConflictError
 from octasplat.workers.db.locks import lock_owner
 from octasplat.workers.db.rows import Dataset, DatasetFile
+
+logger = logging.getLogger(__name__)
 
 
 @retry_on_deadlock
@@ -69,8 +72,12 @@ async def run_commit(service: Service, task: DatasetTask) -> TaskOutcome:
     renewing = asyncio.create_task(_renew_check(service, check))
     try:
         summary = await _validate(service, check.dataset, files)
-    except OctasplatError as error:
-        problem = problem_from_error(error)
+    except Exception as error:  # whatever happens, the dataset must not stay closed
+        if isinstance(error, OctasplatError):
+            problem = problem_from_error(error)
+        else:
+            logger.exception("the commit %s failed", task.id)
+            problem = unexpected_problem()
         return TaskOutcome(problem=problem, apply=lambda connection: _reopen(connection, check))
     finally:
         renewing.cancel()

@@ -100,8 +100,11 @@ async def test_faults_are_told_by_the_task_and_the_dataset_is_open_again(
             )
             assert [fault["file"] for fault in problem["errors"]] == ["sparse/0/images.bin"]
         assert (await http.get(dataset)).json()["state"] == "open"
+        check.error = RuntimeError("a fault of the service")
+        assert (await http.post(f"{dataset}/commit")).status_code == 500
+        assert (await http.get(dataset)).json()["state"] == "open"
         check.error = None
-        assert (await http.post(f"{dataset}/commit")).status_code == 200 and check.begun == 2
+        assert (await http.post(f"{dataset}/commit")).status_code == 200 and check.begun == 3
 
 
 async def test_commit_goes_on_at_the_next_front_end(
