@@ -159,6 +159,32 @@ def test_points_are_picked_where_half_of_the_light_is_stopped(tmp_path: Path) ->
     np.testing.assert_allclose(found[3], [0, 0, 1], atol=1e-6)  # the veil alone stops most of what is stopped
 
 
+def test_what_is_not_drawn_is_not_picked(tmp_path: Path) -> None:
+    """A streak that no photograph shows, before a wall that they show, is passed by as in the picture."""
+    scene = FlatGaussians(
+        means_world=np.float32([[0, -5, 0], *([0.01 * k, 0, 0] for k in range(4))]),
+        quats_wxyz=np.tile(np.float32([1, 0, 0, 1]), (5, 1)),  # the normal is along y
+        log_scales=np.full((5, 2), np.log(0.5), np.float32),
+        opacity_logits=np.full(5, 6.0, np.float32),
+        sh=np.zeros((5, 1, 3), np.float32),
+    )
+    write_gaussian_ply(scene, tmp_path / "scene.ply")
+    found = in_page(
+        """
+        const worker = new Worker("/files/viewer/scene_worker.js", { type: "module" });
+        const answer = (message, name) => new Promise((resolve) => {
+            worker.addEventListener("message", ({ data }) => { if (name in data) resolve(data[name]); });
+            worker.postMessage(message);
+        });
+        await answer({ load: new URL("/files/scene.ply", location.href).href, views: job.views }, "scene");
+        return await answer({ pick: { origin: [0, -8, 0], direction: [0, 1, 0], q: 9.21 }, id: 1 }, "picked");
+        """,
+        tmp_path / "scene.ply",
+        views=shown_views(viewpoints(), 6.0),
+    )
+    np.testing.assert_allclose(found, [0, 0, 0], atol=1e-6)
+
+
 def test_links_keep_a_view_and_nothing_else_is_taken_for_one() -> None:
     found = in_page(
         "const link = linkOf([1.25, -2, 1e-7], [0, 3.5, -40000], 51.5);"

@@ -1,6 +1,7 @@
 """States of a training for the 3D view are few, small and cheap, and change nothing."""
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -114,3 +115,15 @@ def test_sparse_points_are_shown_before_the_training(scene: Path, tmp_path: Path
     assert len(read_scene(tmp_path / event.path)[0]) == event.gaussians
     live.write_points(tmp_path, None)  # not a scene: the run says so itself
     assert len(told) == 1
+
+
+def test_sparse_points_are_of_the_model_that_the_run_takes(
+    tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    scene = make_tiny_dataset(tmp_path_factory, width_px=48, height_px=36)
+    other = make_tiny_dataset(tmp_path_factory, width_px=48, height_px=36, views=5)
+    shutil.copytree(other / "sparse" / "0", scene / "sparse" / "1")
+    live = LiveSceneWriter(tmp_path, lambda _event: None)
+    for model, views in ((None, 8), ("1", 5)):
+        live.write_points(scene, None, model)
+        assert len(json.loads((tmp_path / live_scene.VIEWS_FILE).read_text())["views"]) == views

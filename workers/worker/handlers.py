@@ -81,7 +81,7 @@ def _run_reconstruction(task: Task) -> None:
         if isinstance(event, PhaseFinished) and event.stage in _STAGES_OF_POSES:
             assert task.scene is not None
             if not any((task.run / CHECKPOINTS).glob("*.npz")):
-                live.write_points(task.scene, found_model_folder(task.run))
+                live.write_points(task.scene, found_model_folder(task.run), config.model)
 
     def publish_finished(event: Event) -> None:
         # Whatever becomes of the rest, even if this process is killed.

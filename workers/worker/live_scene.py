@@ -54,14 +54,20 @@ class LiveSceneWriter:
         self._began_at = time.monotonic()
         self._next_at = -math.inf
 
-    def write_points(self, scene: Path, model_folder: Path | None) -> None:
-        """Write the sparse points of a model; nothing where it cannot be read, as the run says so itself."""
+    def write_points(self, scene: Path, model_folder: Path | None, model: str | None = None) -> None:
+        """Write the sparse points of a model; nothing where it cannot be read, as the run says so itself.
+
+        Args:
+            scene: folder of the photographs.
+            model_folder: of a model that was found for them.
+            model: which of several models in ``scene`` the run takes.
+        """
         try:
-            model = load_dataset_model(scene, model_folder=model_folder, for_training=False)
-            gaussians = _point_gaussians(model, model.points)
+            found = load_dataset_model(scene, model_folder=model_folder, model=model, for_training=False)
+            gaussians = _point_gaussians(found, found.points)
         except OctasplatError:
             return
-        self._write(0, gaussians, model, set(model.held_out or ()))
+        self._write(0, gaussians, found, set(found.held_out or ()))
 
     def __call__(self, iteration: int, dataset: Dataset, gaussians: FlatGaussians) -> None:
         """Write the state of the training if that is due."""

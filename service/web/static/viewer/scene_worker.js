@@ -6,11 +6,11 @@
 import { removedBy } from "./cleaning.js";
 import { pick } from "./picking.js";
 import { readGaussians } from "./ply.js";
-import { makeSorter } from "./sorting.js";
+import { makeSorter, shownBy } from "./sorting.js";
 
 const TRIES = 5;
 let sort = null;
-let scene = null; // {count, geometry, bounds, views}: what picking and editing read
+let scene = null; // {count, geometry, bounds, views, shown}: what picking and editing read
 let hidden = null;
 
 /** All bytes of a file; a download that breaks off goes on where it was. */
@@ -59,8 +59,9 @@ async function load(url, views) {
         postMessage({ loaded, total });
     });
     const read = readGaussians(bytes);
-    sort = makeSorter({ ...read, views }); // before the arrays go to the page
-    scene = { count: read.count, geometry: read.geometry.slice(), bounds: read.bounds.slice(), views: views ?? [] };
+    const shown = shownBy(read.count, read.geometry, views ?? []);
+    sort = makeSorter({ ...read, shown }); // before the arrays go to the page
+    scene = { count: read.count, geometry: read.geometry.slice(), bounds: read.bounds.slice(), views: views ?? [], shown };
     postMessage({ scene: read }, [read.geometry.buffer, read.harmonics.buffer, read.bounds.buffer, ...(read.materials ? [read.materials.buffer] : [])]);
 }
 
@@ -76,7 +77,8 @@ onmessage = ({ data }) => {
         return;
     }
     if (data.pick) {
-        postMessage({ picked: pick(scene, data.pick.origin, data.pick.direction, data.pick.q, hidden), id: data.id });
+        const unseen = scene.shown.map((mark, i) => (mark && !hidden?.[i] ? 0 : 1)); // what is not drawn cannot be meant
+        postMessage({ picked: pick(scene, data.pick.origin, data.pick.direction, data.pick.q, unseen), id: data.id });
         return;
     }
     if (data.edit) {

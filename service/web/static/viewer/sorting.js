@@ -8,11 +8,11 @@ const FRAME_MARGIN = 1.1;
 
 /**
  * Makes a function that orders Gaussians whose arrays are as of ply.js; `views` are photographs as of
- * cameras.json. What too few of them show is left out: nothing but streaks is known of it.
+ * cameras.json. What too few of them show is left out (`shown` is 0): nothing but streaks is known of it.
  */
-export function makeSorter({ count, geometry, bounds, views = [] }) {
+export function makeSorter({ count, geometry, bounds, views = [], shown = shownBy(count, geometry, views) }) {
     // Heaviest first, so that the first ones are the best part of a scene to draw alone.
-    const numbers = byWeight(count, geometry, shownBy(count, geometry, views));
+    const numbers = byWeight(count, geometry, shown);
     const all = numbers.length;
     const places = new Float32Array(all * 4);
     for (let k = 0; k < all; k++) {
