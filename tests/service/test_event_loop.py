@@ -190,6 +190,14 @@ def test_excess_is_found_in_the_structure_alone() -> None:
         assert found is not None and found[0] == code
 
 
+@pytest.mark.parametrize("piece", [b"]", b"9" * 400 + b" ", b'"\\', b"1 "])
+def test_excess_is_looked_for_in_a_time_by_the_length(piece: bytes) -> None:
+    body = piece * (MAX_BODY_BYTES // len(piece))
+    begun = time.thread_time()
+    find_excess(body)
+    assert time.thread_time() - begun < 2.0
+
+
 @pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be", "utf-32"])
 async def test_json_is_read_in_utf_8_alone(connect_service: ConnectService, encoding: str) -> None:
     # Bytes of these characters are quotation marks, which would hide the brackets behind them.
