@@ -75,6 +75,7 @@ def write_edited_run(
         DiskFullError: its disk is full.
     """
     check_new_run(target)
+    metadata = facts or read_metadata(source)
     partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
     messages: tuple[str, ...] = ()
     try:
@@ -83,13 +84,13 @@ def write_edited_run(
             if matrix is None:
                 _copy(source, partial)
             elif is_similarity(matrix):
-                messages = write_transformed_run_files(source, partial, matrix)
+                messages = write_transformed_run_files(source, partial, matrix, metadata.origin_world)
             else:
                 messages = (
                     "Cameras and learnt light cannot follow a scene that was mirrored, sheared or scaled "
                     f"unevenly, so {target} holds the scene alone.",
                 )
-            write_gaussian_ply(gaussians, partial / SCENE, facts=facts or read_metadata(source))
+            write_gaussian_ply(gaussians, partial / SCENE, facts=metadata)
             write_json(partial / EDITS_FILE, [*_read_edits(source), dict(edit_record)])
             partial.replace(target)
     except OSError as error:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
+from octasplat.engine.core.local_origin import Origin
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset.views_file import read_views, write_views
 from octasplat.engine.render.environment_files import (
@@ -44,7 +45,7 @@ def is_similarity(matrix: Float[np.ndarray, "4 4"]) -> bool:
 
 
 def write_transformed_run_files(
-    source: Path, target: Path, matrix: Float[np.ndarray, "4 4"]
+    source: Path, target: Path, matrix: Float[np.ndarray, "4 4"], origin_world: Origin
 ) -> tuple[str, ...]:
     """Write the files of a run that depend on its world, transformed by ``matrix``.
 
@@ -54,7 +55,8 @@ def write_transformed_run_files(
     Args:
         source: folder of the run.
         target: folder to write into.
-        matrix: a similarity, see :func:`is_similarity`.
+        matrix: a similarity, see :func:`is_similarity`, between points about their local origins.
+        origin_world: local origin of the result.
 
     Returns:
         What is not as exact as it was, a sentence each.
@@ -64,7 +66,8 @@ def write_transformed_run_files(
         if (source / name).exists():
             shutil.copyfile(source / name, target / name)
     if (source / VIEWS).exists():
-        write_views(target / VIEWS, read_views(source / VIEWS).transformed(scale, turn, matrix[:3, 3]))
+        moved = read_views(source / VIEWS).transformed(scale, turn, matrix[:3, 3])
+        write_views(target / VIEWS, moved.model_copy(update={"origin_world": origin_world}))
     if (source / TRAINING).exists():
         training = json.loads((source / TRAINING).read_text(encoding="utf-8"))
         if "nearest_world" in training:

@@ -10,6 +10,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from octasplat.engine.dataset.views_file import read_views
 from octasplat.engine.files import read_metadata
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from octasplat.engine.render.environment_files import write_environment
@@ -109,3 +110,21 @@ def glb_parts(file: Path) -> tuple[dict, bytes]:
     data = file.read_bytes()
     (length,) = struct.unpack_from("<I", data, 12)
     return json.loads(data[20 : 20 + length]), data[28 + length :]
+
+
+@pytest.mark.parametrize("shift", [(1000.0, 0.0, -20.0), tuple(-x for x in ORIGIN)])
+def test_cameras_of_a_far_run_go_along_with_its_scene(octasplat, runs, tmp_path, shift):
+    """Views and Gaussians of a moved run are about one local origin, and stand where the shift puts them."""
+    _, far = runs
+    call(octasplat, "transform", far, "--translate", *shift, "-o", tmp_path / "moved")
+
+    def places(folder: Path) -> tuple[np.ndarray, np.ndarray, tuple[float, ...]]:
+        record, gaussians = read_views(folder / "views.json"), read_gaussian_ply(folder / "scene.ply")[0]
+        origin = read_metadata(folder).origin_world
+        cameras = np.stack([view.origin_world for view in record.viewpoints(None).views])
+        return cameras + record.origin_world, gaussians.means_world.astype(float) + origin, origin
+
+    before, after = places(far), places(tmp_path / "moved")
+    assert read_views(tmp_path / "moved" / "views.json").origin_world == after[2] != before[2]
+    for one, other in zip(before[:2], after[:2], strict=True):
+        np.testing.assert_allclose(other, one + shift, atol=1e-3)
