@@ -167,7 +167,10 @@ async def delete_upload(
 
 
 async def run_upload(service: Service, task: DatasetTask) -> TaskOutcome:
-    """Store the file of an upload; its parts go, unless room was lacking, so that it can be tried again."""
+    """Store the file of an upload; its parts go, unless that can be tried again.
+
+    As where room was lacking, or the dataset is being checked and will be open again if that finds faults.
+    """
     async with service.pool.connection() as connection:
         upload = await rows.get_upload(connection, uuid.UUID(task.request["upload_id"]))
         if upload is None:
@@ -178,7 +181,7 @@ async def run_upload(service: Service, task: DatasetTask) -> TaskOutcome:
     delete = partial(_delete, upload=upload)
     try:
         result = await uploads.store_named(service, owner, task.dataset_id, upload.path, body)
-    except (StorageFullError, StorageUnavailableError) as error:
+    except (ConflictError, StorageFullError, StorageUnavailableError) as error:
         return TaskOutcome(problem=problem_from_error(error))
     except OctasplatError as error:
         return TaskOutcome(problem=problem_from_error(error), apply=delete)

@@ -240,6 +240,31 @@ async def test_upload_whose_storing_was_given_up_is_begun_again_or_deleted(
         assert [file["path"] for file in listed] == ["images/0.png"]
 
 
+async def test_upload_that_meets_a_commit_is_kept_for_when_the_dataset_is_open_again(
+    connect_service: ConnectService,
+) -> None:
+    async with connect_service() as (http, service):
+        dataset = await new_dataset(http)
+        upload = await new_upload(http, dataset, PICTURE, path="images/a.png")
+        assert (await send(http, upload, 0, PICTURE[:-1])).status_code == 204
+
+        async def close() -> AsyncIterator[bytes]:
+            async with service.pool.connection() as connection:
+                await connection.execute("UPDATE datasets SET state = 'checking'")
+            yield PICTURE[-1:]
+
+        headers = {**PART, "Upload-Offset": str(len(PICTURE) - 1)}
+        last = await http.patch(upload, content=close(), headers=headers)
+        task = await task_over(http, httpx.Response(202, headers={"Location": last.headers["Location"]}))
+        assert (task["state"], task["problem"]["status"]) == ("failed", 409)
+        async with service.pool.connection() as connection:
+            await connection.execute("UPDATE datasets SET state = 'open'")
+        last = await send(http, upload, len(PICTURE), b"")
+        task = await task_over(http, httpx.Response(202, headers={"Location": last.headers["Location"]}))
+        assert task["state"] == "succeeded"
+        assert (await http.get(f"{dataset}/files/images/a.png")).content == PICTURE
+
+
 async def test_upload_that_waits_to_be_stored_is_kept(
     connect_service: ConnectService, monkeypatch: pytest.MonkeyPatch
 ) -> None:
