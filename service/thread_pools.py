@@ -19,7 +19,7 @@ class ThreadPurpose(Enum):
     UNPACKING = auto()
     """Reading archives that have come."""
     CHECKS = auto()
-    """Checking datasets; :mod:`octasplat.service.concurrency_limiter` bounds how many at once."""
+    """Checking datasets; :mod:`octasplat.service.actions.task_runner` bounds how many at once."""
     OPTIONS = auto()
     """Validating options, a stage's text among them."""
     BODIES = auto()
