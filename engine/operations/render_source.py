@@ -68,6 +68,7 @@ class RenderSource:
         viewpoints: where the photographs were taken from.
         max_side: longer side of the photographs in the training, px.
         trained_rad: angle of a pixel of the training.
+        trained_extent: scene extent of the training, world units.
         learnt: background that the run has learnt.
         materials: shading of the run's materials in the light that it has learnt.
         photographs: where the photographs were taken from, at their full size, if that was asked for.
@@ -82,6 +83,7 @@ class RenderSource:
     viewpoints: SplitViewpoints | None = None
     max_side: int | None = None
     trained_rad: float = 0.0
+    trained_extent: float | None = None
     learnt: LearnedBackground | None = None
     materials: DeferredShading | None = None
     photographs: Viewpoints | None = None
@@ -89,9 +91,9 @@ class RenderSource:
 
     @property
     def extent_world(self) -> float:
-        """Return the radius of the cameras, or of a turntable that fits."""
-        if self.viewpoints is not None:
-            return self.viewpoints.extent
+        """Return the radius of the cameras of the training, or of a turntable that fits."""
+        if self.trained_extent is not None:
+            return self.trained_extent
         return gaussian_turntable(self.gaussians).radius
 
 
@@ -162,7 +164,8 @@ def read_render_source(
         options = replace(options, materials=None)
     elif options.materials is None and config.train.materials.learn and has_materials(gaussians):
         progress(Noted(f"{source}: {_SOME_WITHOUT}"))
-    learnt = finished_shading(source, options, run_extent(source, viewpoints.extent))
+    extent = run_extent(source, viewpoints.extent)
+    learnt = finished_shading(source, options, extent)
     facts = read_metadata(source)
     return RenderSource(
         gaussians=gaussians,
@@ -172,6 +175,7 @@ def read_render_source(
         viewpoints=viewpoints,
         max_side=config.max_side,
         trained_rad=facts.pixel_rad,
+        trained_extent=extent,
         learnt=find_background(learnt),
         materials=find_deferred(learnt),
         photographs=photographs,

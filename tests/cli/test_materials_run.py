@@ -126,7 +126,12 @@ def test_cameras_of_other_photographs_change_no_shading(materials_run, octasplat
     frames = [{"camera_to_world": pose, "fov_y_degrees": 50}]
     (tmp_path / "path.json").write_text(json.dumps({"width": 64, "height": 48, "frames": frames}))
     cameras = ("--path", tmp_path / "path.json")
-    for name, more in (("own.exr", ()), ("other.exr", ("--dataset", few))):
-        result = octasplat("render", materials_run, *cameras, *more, "-o", tmp_path / name)
-        assert result.exit_code == 0, result.output
-    assert (tmp_path / "own.exr").read_bytes() == (tmp_path / "other.exr").read_bytes()
+    light = ("--environment", materials_run / "environment.hdr", "--integrator", "split-sum")
+    for verb, options in (("render", ()), ("relight", light)):
+        found = []
+        for more in ((), ("--dataset", few)):
+            output = tmp_path / f"{verb}{len(found)}.exr"
+            result = octasplat(verb, materials_run, *cameras, *options, *more, "-o", output)
+            assert result.exit_code == 0, result.output
+            found.append(output.read_bytes())
+        assert found[0] == found[1], verb
