@@ -151,7 +151,7 @@ def test_material_file_follows_partly_deleted_mesh(shiny_run, octasplat, tmp_pat
         "material", scene, "-o", tmp_path / "out.ply", "--set", "roughness=0.9", "--mesh",
         tmp_path / "part.ply",
     )  # fmt: skip
-    assert done.exit_code == 0 and "relight shows it" in done.output, done.output
+    assert done.exit_code == 0 and "relight shows the materials" in done.output, done.output
     rough = scene_of(tmp_path / "out.ply").channels["roughness"][:, 0] == np.float32(0.9)
     assert set(np.flatnonzero(rough)) == set(mesh.gid[kept].astype(int))
 
