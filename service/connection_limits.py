@@ -10,6 +10,8 @@ ACCEPT_BACKLOG = 128
 """Connections accepted before any of them is looked at."""
 MIN_BODY_BYTES = 1 << 16
 _MIN_CONNECTIONS = 16
+_UNLIMITED_OPEN_FILES = 10_240
+"""What is used of an infinite limit; macOS allows each process as many."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +37,13 @@ class ConnectionLimits:
 
 def raise_file_limit() -> int:
     """Raise the limit of open files to the highest that is allowed, and return it."""
-    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-    return hard
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft == resource.RLIM_INFINITY:
+        return _UNLIMITED_OPEN_FILES
+    # macOS refuses an infinite soft limit.
+    highest = max(soft, _UNLIMITED_OPEN_FILES) if hard == resource.RLIM_INFINITY else hard
+    resource.setrlimit(resource.RLIMIT_NOFILE, (highest, hard))
+    return highest
 
 
 def connections_for(open_files: int) -> int:

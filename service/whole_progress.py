@@ -52,7 +52,7 @@ def whole_progress(job: Job, stages: Sequence[str]) -> WholeProgress:
 
 
 def _stage_seconds(estimate: Mapping[str, Any] | None, stages: Sequence[str]) -> dict[str, float] | None:
-    """Return the estimated seconds of all stages, or None where those of one are not known."""
+    """Return the estimated seconds of all stages, or None where one is not known or all are 0."""
     known = (estimate or {}).get("stage_seconds") or {}
     found = {name: float(known[name]) for name in stages if name in known}
-    return found if len(found) == len(stages) else None
+    return found if len(found) == len(stages) and any(found.values()) else None

@@ -26,6 +26,7 @@ from octasplat.service.schemas.jobs import JobChange, JobView
 from octasplat.service.state import Service
 from octasplat.workers.db.connections import Connection, retry_on_deadlock
 from octasplat.workers.db.holds import read_holds
+from octasplat.workers.db.postgres_text import storable_text
 from octasplat.workers.db.rows import Job, JobState
 from octasplat.workers.queue import jobs as rows
 from octasplat.workers.queue.jobs import JobOrder
@@ -84,10 +85,10 @@ async def list_jobs(
             connection,
             owner=principal.visible_owner,
             states=job_filter.states,
-            kind=_without_nul(job_filter.kind),
-            label=_without_nul(job_filter.label),
+            kind=_searchable_text(job_filter.kind),
+            label=_searchable_text(job_filter.label),
             dataset_id=job_filter.dataset_id,
-            text=_without_nul(job_filter.text),
+            text=_searchable_text(job_filter.text),
             before=before,
             order=job_filter.order,
             limit=limit + 1,
@@ -242,6 +243,6 @@ async def job_view(connection: Connection, service: Service, principal: Principa
     )
 
 
-def _without_nul(text: str | None) -> str | None:
-    """Return the text with NUL replaced, which Postgres cannot hold, so that it matches nothing."""
-    return text if text is None else text.replace("\0", "\N{REPLACEMENT CHARACTER}")
+def _searchable_text(text: str | None) -> str | None:
+    """Return the text with characters replaced that Postgres refuses, so that it matches nothing."""
+    return text if text is None else storable_text(text)

@@ -112,10 +112,16 @@ def _run_model_child(request: ModelRequest, limits: ModelLimits) -> ModelAnswer:
         text = answer.read(MAX_ANSWER_BYTES)
         noise.seek(max(0, noise.seek(0, os.SEEK_END) - 2000))
         output = noise.read(2000)
-    if child.returncode == -signal.SIGXCPU or child.returncode == -signal.SIGKILL:
+    if child.returncode == -signal.SIGXCPU:
         return _failed_answer(
             "model-timeout",
             f"Reading the COLMAP model took more than {limits.cpu_seconds} s of processor time.",
+        )
+    if child.returncode == -signal.SIGKILL:
+        _log.warning("the reader of a COLMAP model was killed: %a", output)
+        return _failed_answer(
+            "model-killed",
+            "The reader of the COLMAP model was killed, perhaps for want of memory; try again later.",
         )
     try:
         return ModelAnswer.model_validate_json(text)

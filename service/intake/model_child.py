@@ -261,14 +261,15 @@ def _enter_sandbox(request: ModelRequest) -> None:
     # The parent ends it where it takes too long, unless it was killed itself.
     with contextlib.suppress(OSError):
         prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    for kind, value in (
-        (resource.RLIMIT_AS, request.memory_bytes),
-        (resource.RLIMIT_CPU, request.cpu_seconds),
-        (resource.RLIMIT_FSIZE, MAX_ANSWER_BYTES),
-        (resource.RLIMIT_CORE, 0),
+    for kind, soft, hard in (
+        (resource.RLIMIT_AS, request.memory_bytes, request.memory_bytes),
+        # At the soft limit SIGXCPU comes, which the parent can tell from a SIGKILL for other reasons.
+        (resource.RLIMIT_CPU, request.cpu_seconds, request.cpu_seconds + 1),
+        (resource.RLIMIT_FSIZE, MAX_ANSWER_BYTES, MAX_ANSWER_BYTES),
+        (resource.RLIMIT_CORE, 0, 0),
     ):
         with contextlib.suppress(ValueError):  # already lower
-            resource.setrlimit(kind, (value, value))
+            resource.setrlimit(kind, (soft, hard))
     confine(hidden=request.hidden, readable=(request.root,), may_start_processes=False)
 
 

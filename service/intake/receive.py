@@ -383,4 +383,4 @@ class _SpoolWriter(VerifyingWriter):
             self._file.flush()
 
     def _discard(self) -> None:
-        """Close the file, which removes it."""
+        """Do nothing: the file goes when its opener closes it."""

@@ -1,5 +1,7 @@
 """Routes of jobs: created, listed, read, cancelled, retried, deleted."""
 
+import hashlib
+import json
 import uuid
 from typing import Annotated
 
@@ -147,7 +149,9 @@ async def delete_job(
 def _job_etag(job: JobWithView) -> str:
     view = job.view
     # The version of the row counts neither other jobs of the queue nor what the notes say of workers.
-    place = "" if view.queue_position is None else f".{view.queue_position}.{len(view.notes)}"
+    place = "" if view.queue_position is None else f".{view.queue_position}"
+    if view.notes:
+        place += f".{hashlib.sha256(json.dumps(view.notes).encode()).hexdigest()[:16]}"
     return f'"{job.row.version}{place}"'
 
 

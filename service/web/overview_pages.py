@@ -119,12 +119,14 @@ async def change_chosen_jobs(
         # What can be done is done, and all refusals are told together at the end.
         try:
             job_id = uuid.UUID(text)
+        except ValueError:
+            refusals.append(f"{text[:40]} is no id of a job.")
+            continue
+        try:
             if do == "cancel":
                 await job_actions.cancel_job(service, principal, job_id)
             else:
                 await job_actions.delete_job(service, principal, job_id, cancel=True)
-        except ValueError:
-            refusals.append(f"{text[:40]} is no id of a job.")
         except ProblemError as problem:
             refusals.append(problem.detail)
         except OctasplatError as error:

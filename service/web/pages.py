@@ -1,4 +1,4 @@
-"""Pages: the list of jobs, one job with its results, a new job; and their parts that refresh themselves."""
+"""Pages: one job with its results, and a new job; and the parts that refresh themselves."""
 
 import json
 import urllib.parse

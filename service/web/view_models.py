@@ -1,5 +1,6 @@
 """View models of the pages on jobs, gathered from the database and the storage."""
 
+import urllib.parse
 import uuid
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -196,7 +197,7 @@ def _display_name(job: Job, names: dict[uuid.UUID, str]) -> str:
 def _thumbnail_address(job: Job, render: Artifact | None) -> str | None:
     if job.preview is not None:
         return f"/v1/jobs/{job.id}/preview?step={job.preview.get('step', 0)}"
-    return None if render is None else f"/v1/jobs/{job.id}/artifacts/{render.name}"
+    return None if render is None else f"/v1/jobs/{job.id}/artifacts/{urllib.parse.quote(render.name)}"
 
 
 def _stage_rows(job: JobView, spent: dict[str, Any]) -> list[StageRow]:

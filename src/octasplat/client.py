@@ -92,7 +92,7 @@ class Client:
         Raises:
             DatasetError: there are no photographs.
             ServiceError: the service refuses the photographs or the options.
-            Unreachable: nobody answers.
+            ServiceUnreachableError: nobody answers.
         """
         what = Submission(_scene(photographs), options, label, queue, priority)
         return Job(self._api, submission.submit(self._api, what, progress or default_progress()))
@@ -126,7 +126,7 @@ class Client:
         Raises:
             ConfigError: two files have one name, or one is not there.
             ServiceError: the service refuses something.
-            Unreachable: nobody answers.
+            ServiceUnreachableError: nobody answers.
         """
         named = files if isinstance(files, Mapping) else {Path(path).name: path for path in files}
         if len(named) < len(files):
@@ -155,7 +155,7 @@ class Client:
 
         Raises:
             ServiceError: the address does not answer well, or the service refuses the photographs.
-            Unreachable: the service was away for two minutes.
+            ServiceUnreachableError: the service was away for two minutes.
         """
         return str(import_scene(self._api, url, name=name, sha256=sha256)["id"])
 
@@ -245,8 +245,8 @@ class Job:
             on_note: told in a sentence when another worker takes the job over.
 
         Raises:
-            JobFailed: it failed or was cancelled.
-            Unreachable: the service was away for two minutes.
+            JobFailedError: it failed or was cancelled.
+            ServiceUnreachableError: the service was away for two minutes.
         """
         try:
             self.content = submission.wait_for_job(

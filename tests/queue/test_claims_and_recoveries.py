@@ -182,7 +182,7 @@ async def test_recovery_logs_entries_that_were_lost(conninfo: str, caplog: pytes
             await connection.execute("DELETE FROM procrastinate_jobs")
         assert await recover_stalled_jobs(pool, SLIPS, 5, StalledAttempts(0.0)) == 0
         assert [record.message for record in caplog.records] == [
-            f"job {attempt.job.id} had no slip in the queue and got a new one"
+            f"job {attempt.job.id} had no entry in the queue and got a new one"
         ]
 
 

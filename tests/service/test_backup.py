@@ -23,6 +23,7 @@ from tests.support.service_harness import (
     claim_job,
     client_with_token,
     committed_dataset,
+    new_job,
     running_service,
     store_content,
     task_over,
@@ -179,3 +180,20 @@ def test_restore_of_invalid_folder_is_refused(conninfo: str, tmp_path: Path, fol
         answer = octasplat(conninfo, tmp_path / "data", "backup", tmp_path / folder)
         assert answer.returncode == 1 and "no backup" in answer.stderr
         assert [path.name for path in (tmp_path / "other").iterdir()] == ["a.txt"]
+
+
+async def test_restored_jobs_that_were_stopping_have_ended(
+    conninfo: str, postgres: EmbeddedPostgres, template: str, tmp_path: Path
+) -> None:
+    backup, here, there = tmp_path / "backup", tmp_path / "here", tmp_path / "there"
+    async with running_service(conninfo, here) as (http, service):
+        job = await new_job(http, service)
+        await claim_job(service, job)
+        stopping = await http.post(f"/v1/jobs/{job['id']}/cancel")
+        assert stopping.json()["state"] == "canceling"
+        create_backup(conninfo, LocalStorage(here / "store", floor_bytes=0), backup)
+    with copied_database(postgres, "template1") as elsewhere:
+        restore_backup(elsewhere, LocalStorage(there / "store", floor_bytes=0), backup)
+        async with running_service(elsewhere, there, has_token=False) as (http, _):
+            restored = (await http.get(f"/v1/jobs/{job['id']}")).json()
+            assert restored["state"] == "canceled" and restored["finished_at"] is not None

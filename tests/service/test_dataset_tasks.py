@@ -255,3 +255,21 @@ async def test_import_ends_when_its_dataset_is_deleted(
 )  # fmt: skip
 def test_prefer_says_how_long_an_answer_waits(prefer: str | None, seconds: float) -> None:
     assert seconds_to_wait(prefer, 20.0) == seconds
+
+
+async def test_front_ends_that_claim_at_once_keep_the_share_of_an_owner(
+    connect_service: ConnectService,
+) -> None:
+    async with connect_service() as (http, service):
+        service.is_draining = True
+        for _ in range(2):
+            dataset = uuid.UUID((await new_dataset(http)).rpartition("/")[2])
+            async with service.pool.connection() as connection:
+                await rows.add_task(connection, dataset, "local", "commit")
+        async with service.pool.connection() as first, service.pool.connection() as second:
+            async with first.transaction():
+                assert await rows.claim_task(first, "commit", max_per_owner=1) is not None
+                claiming = asyncio.create_task(rows.claim_task(second, "commit", max_per_owner=1))
+                await asyncio.sleep(0.3)
+            assert await claiming is None
+            assert await rows.claim_task(second, "commit", max_per_owner=2) is not None

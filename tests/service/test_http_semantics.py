@@ -6,6 +6,7 @@ import pytest
 
 from octasplat.service.app import create_app
 from octasplat.service.settings import ServiceSettings
+from octasplat.workers.db.holds import set_worker_drained
 from octasplat.workers.db.workers import record_worker_heartbeat
 from octasplat.workers.queue.attempts import ResultFile
 from tests.support.api_inventory import operations
@@ -158,6 +159,24 @@ async def test_changes_give_the_etag_that_the_next_change_needs(connect_service:
             assert (stale.status_code, stale.json()["type"]) == (412, "urn:octasplat:problem:precondition")
             fresh = await http.patch(address, json=changes[1], headers={"If-Match": changed.headers["ETag"]})
             assert fresh.status_code == 200, fresh.text
+
+
+async def test_etag_of_waiting_job_changes_with_text_of_notes(
+    connect_service: ConnectService,
+) -> None:
+    async with connect_service() as (http, service):
+        address = f"/v1/jobs/{(await new_job(http, service))['id']}"
+        first = await http.get(address)
+        facts = {"name": "a", "queues": [first.json()["queue"]], "slots": 1, "facts": {}}
+        async with service.pool.connection() as connection:
+            await record_worker_heartbeat(connection, uuid.uuid4(), **facts)
+            await set_worker_drained(connection, "a", True)
+        second = await http.get(address, headers={"If-None-Match": first.headers["ETag"]})
+        assert second.status_code == 200
+        notes = [answer.json()["notes"] for answer in (first, second)]
+        assert [len(texts) for texts in notes] == [1, 1] and notes[0] != notes[1]
+        again = await http.get(address, headers={"If-None-Match": second.headers["ETag"]})
+        assert again.status_code == 304
 
 
 async def test_owners_see_narrow_and_revoke_their_tokens(connect_service: ConnectService) -> None:

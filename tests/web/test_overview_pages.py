@@ -5,6 +5,9 @@ import json
 import re
 import uuid
 
+import pytest
+
+from octasplat.service.actions import jobs as job_actions
 from octasplat.service.web.comparison import differing_settings
 from octasplat.workers.db.connections import open_pool
 from octasplat.workers.db.datasets import create_dataset, put_file
@@ -111,6 +114,36 @@ async def test_chosen_jobs_are_cancelled_and_deleted(connect_service: ConnectSer
         refused = await http.post("/jobs/chosen?do=delete", data={"job": [str(ids[0]), "fox"]})
         assert refused.status_code == 409
         assert "There is no such job." in refused.text and "fox is no id" in refused.text
+
+
+async def test_error_of_an_action_is_not_told_as_wrong_id(
+    connect_service: ConnectService, database: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def fail(*_: object) -> None:
+        raise ValueError("something else")
+
+    monkeypatch.setattr(job_actions, "cancel_job", fail)
+    async with connect_service() as (http, _):
+        with pytest.raises(ValueError, match="something else"):
+            await http.post("/jobs/chosen?do=cancel", data={"job": [str(await make_job(database))]})
+
+
+async def test_pictures_of_jobs_have_quoted_addresses(connect_service: ConnectService, database: str) -> None:
+    async with connect_service() as (http, _):
+        job_id = await make_job(database, kind="render")
+        async with open_pool(database, max_size=1, wait_seconds=10) as pool, pool.connection() as connection:
+            for name, media_type in (("renders/50% #1.png", "image/png"), ("orbit #1.mp4", "video/mp4")):
+                await connection.execute(
+                    "INSERT INTO artifacts (job_id, name, sha256, size_bytes, media_type) "
+                    "VALUES (%s, %s, %s, 1, %s)",
+                    [job_id, name, "0" * 64, media_type],
+                )
+        artifacts = f"/v1/jobs/{job_id}/artifacts"
+        assert f'src="{artifacts}/renders/50%25%20%231.png"' in (await http.get("/")).text
+        page = (await http.get(f"/jobs/{job_id}")).text
+        assert (
+            f'src="{artifacts}/orbit%20%231.mp4"' in page and f'href="{artifacts}/orbit%20%231.mp4"' in page
+        )
 
 
 async def test_variants_are_compared_by_the_settings_that_differ(

@@ -14,6 +14,12 @@ import pytest
 from octasplat.workers.db.connections import IDLE_SECONDS, STATEMENT_SECONDS, open_pool
 from octasplat.workers.db.datasets import create_dataset, put_file
 from octasplat.workers.db.workers import live_workers
+from octasplat.workers.worker.periodic_tasks import (
+    MAX_FAILURES,
+    PeriodicTask,
+    PeriodicTaskError,
+    run_periodically,
+)
 from tests.support.worker_harness import MAX_WAIT_SECONDS, ROOT, WorkerHarness
 
 FROZEN = """
@@ -108,3 +114,30 @@ async def test_frozen_transaction_is_ended_by_timeout(conninfo: str, where: str)
     finally:
         process.kill()
         process.wait(10)
+
+
+async def test_repeated_timeouts_end_a_periodic_task() -> None:
+    begun = 0
+
+    async def hang() -> None:
+        nonlocal begun
+        begun += 1
+        await asyncio.sleep(3600)
+
+    with pytest.raises(PeriodicTaskError, match="hang did not end in time 10 times in a row"):
+        async with asyncio.timeout(30):
+            await run_periodically(PeriodicTask(hang, 0.001, timeout_seconds=0.01))
+    assert begun == MAX_FAILURES
+
+
+async def test_periodic_task_outlasts_lost_database() -> None:
+    errors = [psycopg.OperationalError("gone"), TimeoutError("no route")] * MAX_FAILURES
+
+    async def lose() -> None:
+        if not errors:
+            raise asyncio.CancelledError
+        raise errors.pop()
+
+    with pytest.raises(asyncio.CancelledError):
+        await run_periodically(PeriodicTask(lose, 0.001))
+    assert errors == []

@@ -1,10 +1,14 @@
 """What a child said reaches the journal whole, whenever the end comes."""
 
 import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from octasplat.workers.storage.errors import StorageError
 from octasplat.workers.worker import reporter
 from octasplat.workers.worker.reporter import Reporter
 
@@ -84,3 +88,50 @@ async def test_reporter_logs_progress_at_intervals(monkeypatch: pytest.MonkeyPat
         "Warning: It rains.",
         "Caused by rain",
     ]
+
+
+async def test_reporter_says_which_file_was_not_stored(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Log(SlowJournal):
+        pool = None
+        job = SimpleNamespace(id="j")
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.lines: list[str] = []
+
+        async def add_log_lines(self, lines: tuple[str, ...]) -> None:
+            self.lines += lines
+
+    class Workspace:
+        storage = None
+
+        def __init__(self) -> None:
+            self.checkpoints = 0
+
+        def store_checkpoint(self, _stage: str, _step: int) -> None:
+            self.checkpoints += 1
+
+        def store_file(self, name: str) -> str:
+            raise StorageError(f"{name} is gone.")
+
+    @contextlib.asynccontextmanager
+    async def no_lease(*_: object) -> AsyncIterator[None]:
+        yield None
+
+    monkeypatch.setattr(reporter, "storage_lease", no_lease)
+    journal, workspace = Log(), Workspace()
+    child = Reporter(journal, workspace)  # type: ignore[arg-type]
+    child.on_event({"kind": "stage_finished", "stage": "poses", "seconds": 1.0})
+    child.on_event({"kind": "preview_written", "path": "preview.jpg", "step": 1, "view": "a"})
+    await asyncio.sleep(0.1)
+    await child.finish()
+    child = Reporter(journal, workspace)  # type: ignore[arg-type]
+    child.on_event({"kind": "live_scene_written", "path": "l.ply", "views": "v", "step": 1, "gaussians": 1})
+    await asyncio.sleep(0.1)
+    await child.finish()
+    told = [line for line in journal.lines if "could not be stored" in line]
+    assert [line[line.index("Warning") :] for line in told] == [
+        f"Warning: a {what} could not be stored: run/{name} is gone."
+        for what, name in (("preview", "preview.jpg"), ("live scene", "l.ply"))
+    ]
+    assert workspace.checkpoints == 1

@@ -25,7 +25,7 @@ def make_demo_scene(root: Path, size: Mapping[str, int | None], *, quiet: bool) 
 
     Args:
         root: folder of the scene.
-        size: fields of :class:`GeneratedSceneConfig`; None values take the default.
+        size: fields of :class:`SyntheticDatasetConfig`; None values take the default.
         quiet: show no progress.
 
     Raises:

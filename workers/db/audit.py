@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from datetime import datetime
 
 from octasplat.workers.db.connections import Connection, fetch_all
+from octasplat.workers.db.postgres_text import storable_text
 
 _MAX_CHARACTERS = 500
 
@@ -57,9 +58,9 @@ async def add_entry(
             owner,
             token_id,
             session_id,
-            _storable_text(address),
-            _storable_text(action),
-            target and _storable_text(target),
+            _bounded_text(address),
+            _bounded_text(action),
+            target and _bounded_text(target),
             status,
         ],
     )
@@ -86,6 +87,6 @@ async def delete_old_entries(connection: Connection, hours: float) -> None:
         )
 
 
-def _storable_text(text: str) -> str:
+def _bounded_text(text: str) -> str:
     """Return a text cut to a bounded length and without characters that Postgres refuses."""
-    return text.replace("\0", "\N{REPLACEMENT CHARACTER}")[:_MAX_CHARACTERS]
+    return storable_text(text)[:_MAX_CHARACTERS]

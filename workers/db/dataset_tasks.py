@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 from octasplat.workers.db.connections import Connection, fetch_all, fetch_one
 from octasplat.workers.db.ids import new_id
+from octasplat.workers.db.locks import lock_tasks
 from octasplat.workers.db.postgres_text import as_json
 
 TaskKind = Literal["commit", "import", "upload"]
@@ -144,26 +145,28 @@ async def claim_task(connection: Connection, kind: TaskKind, *, max_per_owner: i
         kind: of task.
         max_per_owner: how many of one owner are worked on at once.
     """
-    # In one statement, in which front ends that ask at once skip the row that another one has.
-    return await fetch_one(
-        connection,
-        DatasetTask,
-        """
-        UPDATE dataset_tasks SET state = 'running', attempt = attempt + 1, started_at = clock_timestamp(),
-            seen_at = clock_timestamp()
-        WHERE id = (
-            SELECT task.id FROM dataset_tasks task CROSS JOIN LATERAL (
-                SELECT count(*) FILTER (WHERE state = 'running') AS running, max(started_at) AS turn_at
-                FROM dataset_tasks WHERE owner = task.owner AND kind = task.kind
-            ) turn
-            WHERE task.state = 'queued' AND task.kind = %(kind)s AND turn.running < %(most)s
-            ORDER BY turn.running, turn.turn_at NULLS FIRST, task.id LIMIT 1
-            FOR UPDATE OF task SKIP LOCKED
+    async with connection.transaction():
+        # Front ends that ask at once would each count without what the other one claims.
+        await lock_tasks(connection, kind)
+        return await fetch_one(
+            connection,
+            DatasetTask,
+            """
+            UPDATE dataset_tasks SET state = 'running', attempt = attempt + 1, started_at = clock_timestamp(),
+                seen_at = clock_timestamp()
+            WHERE id = (
+                SELECT task.id FROM dataset_tasks task CROSS JOIN LATERAL (
+                    SELECT count(*) FILTER (WHERE state = 'running') AS running, max(started_at) AS turn_at
+                    FROM dataset_tasks WHERE owner = task.owner AND kind = task.kind
+                ) turn
+                WHERE task.state = 'queued' AND task.kind = %(kind)s AND turn.running < %(most)s
+                ORDER BY turn.running, turn.turn_at NULLS FIRST, task.id LIMIT 1
+                FOR UPDATE OF task SKIP LOCKED
+            )
+            RETURNING {}
+            """,
+            {"kind": kind, "most": max_per_owner},
         )
-        RETURNING {}
-        """,
-        {"kind": kind, "most": max_per_owner},
-    )
 
 
 async def renew_tasks(connection: Connection, tasks: Sequence[DatasetTask]) -> set[uuid.UUID]:

@@ -4,7 +4,8 @@
 2. The lock of the storage (advisory): shared for transactions that reference contents, exclusive for
    those that mark unused ones.
 3. The lock of an owner (advisory): the owner's usage is compared with the quota and counted.
-4. Rows: jobs, then datasets, then whatever belongs to them.
+4. The lock of a kind of task on datasets (advisory): tasks of an owner are counted and one is claimed.
+5. Rows: jobs, then datasets, then whatever belongs to them.
 
 So no transaction that has locked a row of a job or a dataset waits for an advisory lock: a heartbeat waits
 for its row only as long as a few statements take. The storage, and anything else on the network, is not
@@ -20,6 +21,8 @@ ROW_SECONDS = 10
 """A transaction that has locked a job and falls silent for so long is undone; its process is gone."""
 OWNER = 0x71756F74  # "quot"; the database's triggers know it as well
 
+TASKS = 0x7461736B  # "task"
+
 
 async def lock_store(connection: Connection, *, shared: bool) -> None:
     """Take the lock of the storage until the transaction ends."""
@@ -30,6 +33,11 @@ async def lock_store(connection: Connection, *, shared: bool) -> None:
 async def lock_owner(connection: Connection, owner: str) -> None:
     """Take the lock of an owner until the transaction ends; harmless if it is held already."""
     await connection.execute("SELECT pg_advisory_xact_lock(%s, hashtext(%s))", [OWNER, owner])
+
+
+async def lock_tasks(connection: Connection, kind: str) -> None:
+    """Take the lock of a kind of task on datasets until the transaction ends."""
+    await connection.execute("SELECT pg_advisory_xact_lock(%s, hashtext(%s))", [TASKS, kind])
 
 
 async def about_to_lock_jobs(connection: Connection) -> None:

@@ -181,7 +181,10 @@ def restore_backup(
                 connection.execute("SELECT setval(%s::regclass, %s)", [name, value])
         # Nobody works on them here.
         connection.execute("UPDATE jobs SET state = 'queued', worker = NULL WHERE state = 'running'")
-        connection.execute("UPDATE jobs SET state = 'canceled', slip = NULL WHERE state = 'canceling'")
+        connection.execute(
+            "UPDATE jobs SET state = 'canceled', finished_at = now(), slip = NULL, seconds_left = NULL "
+            "WHERE state = 'canceling'"
+        )
         missing = _referenced_contents(connection) - listed
         missing -= set(record.get("lacks", ()))  # of which was told when it was made
         if missing:

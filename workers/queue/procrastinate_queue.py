@@ -21,7 +21,7 @@ class ProcrastinateQueue:
     """A job queue in the tables of Procrastinate.
 
     Args:
-        pool: connections; only :meth:`work` needs it.
+        pool: connections; only :meth:`consume` needs it.
         heartbeat_seconds: how often a worker says that it lives.
         stale_seconds: after how long without it is taken for dead.
         poll_seconds: how often to look for queue entries that no notification told of.

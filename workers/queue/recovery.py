@@ -87,6 +87,6 @@ async def recover_stalled_jobs(
                 again = await get_job(connection, job_id, lock=True)
                 # If it got another entry meanwhile, requeue_job replaces that one.
                 if again is not None and again.state == "queued":
-                    logger.warning("job %s had no slip in the queue and got a new one", job_id)
+                    logger.warning("job %s had no entry in the queue and got a new one", job_id)
                     await requeue_job(connection, job_queue, again)
     return len(lost)

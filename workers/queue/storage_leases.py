@@ -97,7 +97,7 @@ class StorageLease:
             contents: their digests.
 
         Raises:
-            StorageUnavailableError: as by :meth:`look`.
+            StorageUnavailableError: as by :meth:`verify`.
         """
         while True:
             looked = await self.verify(contents)

@@ -112,7 +112,7 @@ async def kill_after_timeout(
 
     Args:
         children: the processes; :meth:`SupervisedProcess.stop` was called.
-        tasks: what runs :meth:`SupervisedProcess.keep`.
+        tasks: what runs :meth:`SupervisedProcess.supervise`.
         seconds: how long they may take.
     """
     _, late = await asyncio.wait(tasks, timeout=seconds)

@@ -131,7 +131,7 @@ def merge_files(*groups: Iterable[TreeFile]) -> tuple[TreeFile, ...]:
 
 
 def publish_manifest(storage: Storage, name: str, manifest: Manifest) -> bool:
-    """Publish the manifest of a tree whose files are stored; see :meth:`Storage.publish`."""
+    """Publish the manifest of a tree whose files are stored; see :meth:`Storage.publish_document`."""
     return storage.publish_document(name, manifest.to_bytes())
 
 

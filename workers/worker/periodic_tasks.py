@@ -32,24 +32,25 @@ async def run_periodically(task: PeriodicTask) -> None:
     """Run a task for ever.
 
     Raises:
-        PeriodicTaskError: it failed :data:`MAX_FAILURES` times in a row, and not for want of the database.
+        PeriodicTaskError: it failed or did not end in time :data:`MAX_FAILURES` times in a row, and not for
+            want of the database.
     """
     name = getattr(task.action, "__name__", "a periodic task").strip("_")
     failures = 0
     while True:
+        limit = asyncio.timeout(max(task.timeout_seconds, 10 * task.interval_seconds))
         try:
-            async with asyncio.timeout(max(task.timeout_seconds, 10 * task.interval_seconds)):
+            async with limit:
                 await task.action()
             failures = 0
-        # Before DATABASE_ERRORS, which TimeoutError is among.
-        except TimeoutError as error:
-            failures += 1
-            logger.error("%s did not end in time and is begun again: %s", name, error)
-        except DATABASE_ERRORS as error:
-            logger.info("%s has to wait: %s", name, error)
         except Exception as error:
-            failures += 1
-            logger.exception("%s failed and is done again", name)
-            if failures >= MAX_FAILURES:
-                raise PeriodicTaskError(f"{name} failed {failures} times in a row: {error}") from error
+            # DATABASE_ERRORS have TimeoutError among them, which is the limit's error too.
+            if isinstance(error, DATABASE_ERRORS) and not limit.expired():
+                logger.info("%s has to wait: %s", name, error)
+            else:
+                failures += 1
+                what = "did not end in time" if limit.expired() else "failed"
+                logger.exception("%s %s and is begun again", name, what)
+                if failures >= MAX_FAILURES:
+                    raise PeriodicTaskError(f"{name} {what} {failures} times in a row: {error}") from error
         await asyncio.sleep(task.interval_seconds)

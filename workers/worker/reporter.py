@@ -212,23 +212,23 @@ class Reporter:
             except FencedError:
                 return
             except Exception:
-                logger.exception("a checkpoint of job %s was not kept", self._attempt.job.id)
+                logger.exception("what job %s has reached was not stored", self._attempt.job.id)
 
     async def _store_pending(self) -> None:
         """Store the newest checkpoint and picture, if there are new ones."""
         pending, self._wanted_checkpoint = self._wanted_checkpoint, None
         preview, self._preview = self._preview, None
         live_scene, self._live_scene = self._live_scene, None
+        what = "checkpoint"
         try:
             if pending is not None:
                 await self._store_checkpoint(*pending)
+                pending = None
+            what = "preview"
             if preview is not None:
-                async with storage_lease(self._attempt.pool, self._workspace.storage) as note:
-                    sha256 = await asyncio.to_thread(
-                        self._workspace.store_file, f"{RUN_FOLDER}/{preview['path']}"
-                    )
-                    row = {"sha256": sha256, "step": preview["step"], "view": preview["view"]}
-                    await self._attempt.record_preview(row, note)
+                await self._store_preview(preview)
+                preview = None
+            what = "live scene"
             if live_scene is not None:
                 await self._store_live_scene(live_scene)
         except asyncio.CancelledError:
@@ -239,10 +239,16 @@ class Reporter:
             )
             raise
         except (StorageError, *_IGNORED_ERRORS) as error:
-            logger.warning("checkpoint of job %s was not stored: %s", self._attempt.job.id, error)
-            self.add_note(f"Warning: a checkpoint could not be stored: {error}")
-            # Tried again with the next wish to store, unless that is for a newer checkpoint.
+            logger.warning("a %s of job %s was not stored: %s", what, self._attempt.job.id, error)
+            self.add_note(f"Warning: a {what} could not be stored: {error}")
+            # A checkpoint is tried again with the next wish to store, unless that is for a newer checkpoint.
             self._wanted_checkpoint = self._wanted_checkpoint or pending
+
+    async def _store_preview(self, event: Mapping[str, Any]) -> None:
+        async with storage_lease(self._attempt.pool, self._workspace.storage) as note:
+            sha256 = await asyncio.to_thread(self._workspace.store_file, f"{RUN_FOLDER}/{event['path']}")
+            row = {"sha256": sha256, "step": event["step"], "view": event["view"]}
+            await self._attempt.record_preview(row, note)
 
     async def _store_live_scene(self, event: Mapping[str, Any]) -> None:
         async with storage_lease(self._attempt.pool, self._workspace.storage) as note:

@@ -16,6 +16,7 @@ from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.render.resume import MOVED_FILE, RECORD_FILE
 from octasplat.workers.db.rows import Job
 from octasplat.workers.storage.errors import StorageError
+from octasplat.workers.storage.os_errors import translate_os_errors
 from octasplat.workers.storage.protocol import Storage
 from octasplat.workers.storage.trees import TreeFile
 from octasplat.workers.storage.untrusted_folder import UntrustedFolder
@@ -80,7 +81,7 @@ class StoredFrames:
         """Take over the frames of a checkpoint, and return its files that are to be fetched.
 
         Raises:
-            StorageError: a frame is gone or damaged.
+            StorageError: a frame is gone or damaged, or the folder cannot be written.
         """
         files = list(files)
         fetched = self.fetched(files)
@@ -93,8 +94,9 @@ class StoredFrames:
             check_content(storage.read(file.sha256), file.sha256)
         moved = {name.removeprefix(_FRAMES): file.sha256 for name, file in self._files.items()}
         folder = self._folder / RUN_FOLDER / FRAMES_FOLDER
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / MOVED_FILE).write_text(json.dumps(moved), encoding="utf-8")
+        with translate_os_errors(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / MOVED_FILE).write_text(json.dumps(moved), encoding="utf-8")
         return fetched
 
     def fetched(self, files: Iterable[TreeFile]) -> list[TreeFile]:

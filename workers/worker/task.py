@@ -37,8 +37,8 @@ class Task:
     """One job, as its program sees it.
 
     Attributes:
-        folder: the attempt's own folder; ``folder / RUN`` holds the source job's results, or what an earlier
-            attempt left to go on from.
+        folder: the attempt's own folder; ``folder / RUN_FOLDER`` holds the source job's results, or what an
+            earlier attempt left to go on from.
         options: complete options, as JSON values.
         scene: folder of the photographs, or None.
         title: what the user calls the photographs.

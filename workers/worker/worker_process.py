@@ -419,6 +419,6 @@ def _on_unhandled_exception(loop: asyncio.AbstractEventLoop, context: dict[str, 
     """Ignore that an entry taken from this worker can no longer be acknowledged."""
     error = context.get("exception")
     if isinstance(error, ConnectorException):
-        logger.info("a slip of another attempt was left alone: %s", error.__cause__ or error)
+        logger.info("a queue entry of another attempt was left alone: %s", error.__cause__ or error)
     else:
         loop.default_exception_handler(context)

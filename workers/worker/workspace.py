@@ -131,20 +131,28 @@ class Workspace:
         return self._peak_used_bytes
 
     def fetch_dataset(self, dataset_id: uuid.UUID, files: Sequence[DatasetFile], name: str) -> Path:
-        """Fetch the photographs into a folder shared by all attempts here; its files must not be changed."""
+        """Fetch the photographs into a folder shared by all attempts here; its files must not be changed.
+
+        Raises:
+            StorageError: a photograph is gone or damaged, or the folder cannot be written.
+        """
         folder = self._root / "datasets" / str(dataset_id)
-        self._dataset_lock = lock_dataset_folder(folder)
-        place = folder / (re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_")[:60] or "scene")
-        if not place.exists():
-            # Other attempts look for the final name, which only a complete folder gets.
-            partial = folder / f".{uuid.uuid4().hex}.partial"
-            try:
-                fetch_tree(self.storage, _tree_files(files), partial)
-                with contextlib.suppress(OSError):  # another attempt was faster
-                    partial.rename(place)
-            finally:
-                shutil.rmtree(partial, ignore_errors=True)
-        os.utime(folder)  # the sweep goes by this time
+        with translate_os_errors(folder):
+            self._dataset_lock = lock_dataset_folder(folder)
+            place = folder / (re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_")[:60] or "scene")
+            if not place.exists():
+                # Other attempts look for the final name, which only a complete folder gets.
+                partial = folder / f".{uuid.uuid4().hex}.partial"
+                try:
+                    fetch_tree(self.storage, _tree_files(files), partial)
+                    try:
+                        partial.rename(place)
+                    except OSError:
+                        if not place.exists():  # else another attempt was faster
+                            raise
+                finally:
+                    shutil.rmtree(partial, ignore_errors=True)
+            os.utime(folder)  # the sweep goes by this time
         self._dataset = place
         return place
 

@@ -59,7 +59,11 @@ def sweep_workspaces(root: Path, dataset_seconds: float = 86_400.0) -> int:
         except BlockingIOError:  # its worker is alive
             continue
         except OSError:
-            if time.time() - folder.stat().st_mtime < 60:
+            try:
+                age_seconds = time.time() - folder.stat().st_mtime
+            except FileNotFoundError:  # its worker has removed it just now
+                continue
+            if age_seconds < 60:
                 continue  # being made right now
             remove_folder(folder)
         else:

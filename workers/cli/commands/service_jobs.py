@@ -5,16 +5,13 @@ import time
 from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from octasplat.engine.core.durations import format_duration
 from octasplat.workers.cli.printing import Printer, local_time, output_options, table_lines
 from octasplat.workers.cli.service_options import connected, limit_option, server_option
-
-if TYPE_CHECKING:
-    pass
 
 _NO_WORKERS = "No live workers, or none that this token may see; administrators see all."
 STATES = ("queued", "running", "canceling", "succeeded", "failed", "canceled")

@@ -1,0 +1,83 @@
+"""Folders of attempts on disks that fail, and their removal while workers remove them."""
+
+import errno
+import os
+import shutil
+import time
+import uuid
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from octasplat.workers.storage.errors import StorageFullError, StorageUnavailableError
+from octasplat.workers.storage.local import LocalStorage
+from octasplat.workers.storage.trees import TreeFile
+from octasplat.workers.worker import workspace_locks
+from octasplat.workers.worker.stored_frames import StoredFrames
+from octasplat.workers.worker.task import FRAMES_FOLDER, RUN_FOLDER
+from octasplat.workers.worker.workspace import Workspace
+from octasplat.workers.worker.workspace_locks import LOCK_FILE, sweep_workspaces
+
+
+def make_workspace(folder: Path) -> Workspace:
+    job: Any = SimpleNamespace(id=uuid.uuid4(), attempt=1, kind="unknown", options={})
+    return Workspace(folder / "work", job, LocalStorage(folder / "store", floor_bytes=0))
+
+
+def full(*_arguments: object, **_named: object) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_photographs_on_failing_disk_raise_errors_of_storage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset = uuid.uuid4()
+    for where, name in ((Path, "rename"), (os, "utime")):
+        workspace = make_workspace(tmp_path)
+        with monkeypatch.context() as patch:
+            patch.setattr(where, name, full)
+            with pytest.raises(StorageFullError):
+                workspace.fetch_dataset(dataset, [], "d")
+        workspace.close()
+    workspace = make_workspace(tmp_path)
+    place = workspace.fetch_dataset(dataset, [], "d")
+    assert place.is_dir() and [path.name for path in place.parent.iterdir() if path != place] == [LOCK_FILE]
+    workspace.close()
+    shutil.rmtree(tmp_path / "work" / "datasets")
+    (tmp_path / "work" / "datasets").touch()
+    with pytest.raises(StorageUnavailableError):
+        workspace.fetch_dataset(dataset, [], "d")
+
+
+def test_stored_frames_on_failing_disk_raise_errors_of_storage(tmp_path: Path) -> None:
+    storage = LocalStorage(tmp_path / "store", floor_bytes=0)
+    with storage.open_writer() as writer:
+        writer.write(b"a frame")
+        blob = writer.commit()
+    frame = TreeFile(
+        path=f"{RUN_FOLDER}/{FRAMES_FOLDER}/0.png", sha256=blob.sha256, size_bytes=blob.size_bytes
+    )
+    (tmp_path / RUN_FOLDER).touch()
+    with pytest.raises(StorageUnavailableError):
+        StoredFrames(tmp_path, are_removed=True).adopt([frame], storage)
+
+
+def test_sweep_goes_on_after_folder_that_its_worker_removes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("a", "b", "c"):
+        (tmp_path / "attempts" / name).mkdir(parents=True)
+        os.utime(tmp_path / "attempts" / name, (time.time() - 3600,) * 2)
+    removed: list[str] = []
+
+    def open_locked(path: Path, *, create: bool) -> None:
+        if not removed:
+            removed.append(path.parent.name)
+            shutil.rmtree(path.parent)
+        raise FileNotFoundError(path)
+
+    monkeypatch.setattr(workspace_locks, "open_locked", open_locked)
+    assert sweep_workspaces(tmp_path) == 2
+    assert list((tmp_path / "attempts").iterdir()) == []
