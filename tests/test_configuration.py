@@ -225,3 +225,11 @@ def test_section_of_another_kind_begins_anew() -> None:
     }  # fmt: skip
     assert merge_options(base, {"lr": 5})["lr"] == 5
     assert base["lr"] == {"x": 1, "y": 2}
+
+
+@pytest.mark.parametrize("section", [{"train": None}, {"train": 5}, None, [1]])
+def test_configuration_without_sections_is_refused_by_name(tmp_path: Path, section: object) -> None:
+    path = tmp_path / "config.json"
+    path.write_text(json.dumps({"reconstruction": section}), encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"config\.json"):
+        read_config(path)

@@ -141,9 +141,11 @@ EVENT_KINDS: dict[str, type[Event]] = {
         TrainingProgress,
         HeldOutMeasured,
         CheckpointWritten,
+        ImagesSaved,
         Warned,
         Noted,
         KernelsCompiled,
+        RunFinished,
     )
 }
 
@@ -161,7 +163,11 @@ def parse_event(kind: str, content: Mapping[str, Any]) -> Event | None:
     model = EVENT_KINDS.get(kind)
     if model is None or not {f.name for f in fields(model) if f.default is MISSING} <= content.keys():
         return None
-    return model(**{field.name: content[field.name] for field in fields(model) if field.name in content})
+    given = {field.name: content[field.name] for field in fields(model) if field.name in content}
+    # JSON has lists where events have tuples.
+    return model(
+        **{name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
+    )
 
 
 def ignore_events(_event: Event) -> None:

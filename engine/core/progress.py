@@ -97,7 +97,10 @@ def counted_phase(name: str, progress: EventListener, steps: int = 0) -> Iterato
 def stop_when_asked(
     progress: EventListener, should_stop: Callable[[], bool], message: str | None = None
 ) -> EventListener:
-    """Return ``progress`` with a check at each event that stops the work when ``should_stop`` is true.
+    """Return ``progress`` with a check that stops the work when ``should_stop`` is true.
+
+    It is made where a stage begins, and at each step of one that counts its steps; training, which has events
+    of its own, stops by itself.
 
     The returned listener raises :class:`octasplat.engine.core.errors.CancelledError` with ``message``, or
     one that names the stage.
@@ -105,7 +108,7 @@ def stop_when_asked(
 
     def listen(event: Event) -> None:
         progress(event)
-        if isinstance(event, PhaseProgress) and should_stop():
+        if isinstance(event, PhaseStarted | PhaseProgress) and should_stop():
             doing = PHASE_TITLES.get(event.stage, event.stage).lower()
             default_message = f"Stopped while {doing}; the same command with --resume goes on."
             raise CancelledError(message or default_message)

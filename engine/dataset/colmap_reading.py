@@ -1,6 +1,6 @@
 """Reading the poses of a scene into a reconstruction of pycolmap, whatever program wrote the files."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -50,7 +50,7 @@ def load_model(path: Path, sizes_px: Mapping[str, tuple[int, int]] | None = None
         DatasetError: a file is missing or damaged; the sentence names it, and the line where there are lines.
     """
     if path.is_file():
-        found = read_transforms(path, _PhotographSizes(path.parent, sizes_px))
+        found = read_transforms(path, lambda names: _photograph_sizes(names, path.parent, sizes_px))
         reconstruction, _ = _build(path, found.records)
         return LoadedModel(reconstruction, found.records.repairs, found.held_out, found.masks)
     check_binary_colmap_model(path)
@@ -81,25 +81,24 @@ def _build(path: Path, records: ModelRecords) -> tuple[Any, int]:
         ) from error
 
 
-class _PhotographSizes:
-    """Tells the sizes of photographs by the names that a model gives them."""
-
-    def __init__(self, root: Path, sizes_px: Mapping[str, tuple[int, int]] | None) -> None:
-        self._sizes_px = sizes_px
-        self._paths = photographs_below(image_folder(root)) if sizes_px is None else {}
-
-    def __call__(self, name: str) -> tuple[int, int]:
-        known = self._paths if self._sizes_px is None else self._sizes_px
-        file = match_image_names([name], known.keys()).get(name)
-        if file is None:
+def _photograph_sizes(
+    names: Sequence[str], root: Path, sizes_px: Mapping[str, tuple[int, int]] | None
+) -> dict[str, tuple[int, int]]:
+    """Return the sizes of photographs by the names that a model gives them."""
+    if not names:
+        return {}
+    paths = photographs_below(image_folder(root)) if sizes_px is None else {}
+    files = match_image_names(names, paths.keys() if sizes_px is None else sizes_px.keys())
+    for name in names:
+        if name not in files:
             raise DatasetError(
                 f"The photograph {name} of the transforms file is not there, and the file does not say how "
                 "large it is (w and h); put it there."
             )
-        if self._sizes_px is not None:
-            return self._sizes_px[file]
-        # Needs OpenImageIO, which the front end lacks; it gives the sizes.
-        from octasplat.engine.dataset.images import read_image_info
+    if sizes_px is not None:
+        return {name: sizes_px[files[name]] for name in names}
+    # Needs OpenImageIO, which the front end lacks; it gives the sizes.
+    from octasplat.engine.dataset.images import read_image_info
 
-        info = read_image_info(self._paths[file])
-        return info.width_px, info.height_px
+    infos = {name: read_image_info(paths[files[name]]) for name in names}
+    return {name: (info.width_px, info.height_px) for name, info in infos.items()}

@@ -19,8 +19,10 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from octasplat.engine.core.errors import DatasetError
-from octasplat.engine.dataset.images import read_photo
+from octasplat.engine.dataset.image_info import Storage
+from octasplat.engine.dataset.images import ValueScale, read_photo
 from octasplat.engine.dataset.model import DatasetModel, scene_extent
+from octasplat.engine.dataset.value_scale import find_value_scales
 
 NEAR_SHIFT, NEAR_TURN_RAD = 2e-3, 5e-3
 """Pictures that hardly differ are duplicates if they stand no farther apart than this share of the scene's
@@ -125,14 +127,26 @@ def _near_pictures(model: DatasetModel, poses: _Poses, known: set[Group]) -> lis
     close = cKDTree(poses.centres).query_pairs(NEAR_SHIFT * poses.extent, output_type="ndarray")
     near = poses.near_pairs(close.astype(np.int64), NEAR_SHIFT, NEAR_TURN_RAD)
     pairs = [pair for pair in near if pair not in known]
-    small = {index: _small_picture(model, index) for index in sorted({i for pair in pairs for i in pair})}
+    indices = sorted({index for pair in pairs for index in pair})
+    scales = _value_scales(model, indices)
+    small = {
+        index: _small_picture(model, index, scales.get(model.image_infos[index].storage)) for index in indices
+    }
     return [(a, b) for a, b in pairs if _rms_difference(small[a], small[b]) <= NEAR_DIFFERENCE]
 
 
-def _small_picture(model: DatasetModel, index: int) -> Float32[np.ndarray, "h w 3"]:
+def _value_scales(model: DatasetModel, indices: Sequence[int]) -> dict[Storage, ValueScale]:
+    """Return the scales that the photographs of ``indices`` are trained with."""
+    photographs = [(view.image_path, info) for view, info in zip(model.views, model.image_infos, strict=True)]
+    # All photographs of a storage share a scale; they are read only if those compared seem to have one.
+    scaled, _ = find_value_scales([photographs[index] for index in indices])
+    return find_value_scales([each for each in photographs if each[1].storage in scaled])[0]
+
+
+def _small_picture(model: DatasetModel, index: int, scale: ValueScale | None) -> Float32[np.ndarray, "h w 3"]:
     info = model.image_infos[index]
     width, height = min(_SMALL_SIDE_PX, info.width_px), min(_SMALL_SIDE_PX, info.height_px)
-    return read_photo(model.views[index].image_path, width, height, 8)[0].astype(np.float32)
+    return read_photo(model.views[index].image_path, width, height, 8, scale)[0].astype(np.float32)
 
 
 def _rms_difference(one: Float32[np.ndarray, "h w 3"], two: Float32[np.ndarray, "h w 3"]) -> float:

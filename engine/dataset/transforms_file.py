@@ -24,8 +24,8 @@ from octasplat.engine.dataset.colmap_records import CameraRecord, ImageRecord, M
 ONE_FILE, TRAIN_FILE, TEST_FILE, VALIDATION_FILE = (
     "transforms.json", "transforms_train.json", "transforms_test.json", "transforms_val.json",
 )  # fmt: skip
-SizeOf = Callable[[str], tuple[int, int]]
-"""Tells the size of a photograph by its name below the folder of the photographs, in pixels."""
+SizesOf = Callable[[Sequence[str]], Mapping[str, tuple[int, int]]]
+"""Returns the sizes of photographs in pixels, by their names below the folder of the photographs."""
 
 _ROTATION_TOLERANCE = 1e-3
 _PINHOLES = frozenset({"PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE"})
@@ -80,6 +80,7 @@ class _File(_Lens):
 
 
 _LENS_KEYS = tuple(_Lens.model_fields)
+_SIZE_KEYS = frozenset({"w", "h"})
 
 
 @dataclass(frozen=True)
@@ -102,12 +103,12 @@ def transforms_file(root: Path) -> Path | None:
     return next((path for name in (ONE_FILE, TRAIN_FILE) if (path := root / name).is_file()), None)
 
 
-def read_transforms(path: Path, size_of: SizeOf) -> TransformsModel:
+def read_transforms(path: Path, sizes_of: SizesOf) -> TransformsModel:
     """Read the poses that ``path`` gives, and those of the test views beside a ``transforms_train.json``.
 
     Args:
         path: a ``transforms.json`` or ``transforms_train.json``.
-        size_of: asked where the files do not say how large photographs are.
+        sizes_of: returns width and height of photographs that the files do not say them of, by their names.
 
     Raises:
         DatasetError: something is missing, or makes no camera or pose; the sentence names file and frame.
@@ -132,10 +133,11 @@ def read_transforms(path: Path, size_of: SizeOf) -> TransformsModel:
     cameras: dict[tuple[object, ...], CameraRecord] = {}
     images: dict[int, ImageRecord] = {}
     masks: dict[str, str] = {}
+    sizes_px = sizes_of(_unsized_photographs(files))
     for part, file in zip(parts, files, strict=True):
         for frame in file.frames:
             name = photograph_name(frame.file_path)
-            model, width, height, params = _camera_of_frame(part, file, frame, size_of)
+            model, width, height, params = _camera_of_frame(part, file, frame, sizes_px)
             key = (model, width, height, params)
             camera = cameras.setdefault(key, CameraRecord(len(cameras) + 1, model, width, height, params))
             number = len(images) + 1
@@ -176,19 +178,35 @@ def _read_file(path: Path) -> _File:
     return file
 
 
-def _camera_of_frame(
-    path: Path, file: _File, frame: _Frame, size_of: SizeOf
-) -> tuple[str, int, int, tuple[float, ...]]:
-    """Return model, width, height and parameters of the camera of a frame, in COLMAP's terms."""
-    values = {
+def _unsized_photographs(files: Sequence[_File]) -> list[str]:
+    """Return the names of the photographs that the files do not say the size of, each once."""
+    names = (
+        photograph_name(frame.file_path)
+        for file in files
+        for frame in file.frames
+        if not _lens_values(file, frame).keys() >= _SIZE_KEYS
+    )
+    return list(dict.fromkeys(names))
+
+
+def _lens_values(file: _File, frame: _Frame) -> dict[str, Any]:
+    """Return the values of a frame's lens that are given, for it or for all frames."""
+    return {
         key: value
         for key in _LENS_KEYS
         if (value := getattr(file, key) if getattr(frame, key) is None else getattr(frame, key)) is not None
     }
-    if {"w", "h"} <= values.keys():
+
+
+def _camera_of_frame(
+    path: Path, file: _File, frame: _Frame, sizes_px: Mapping[str, tuple[int, int]]
+) -> tuple[str, int, int, tuple[float, ...]]:
+    """Return model, width, height and parameters of the camera of a frame, in COLMAP's terms."""
+    values = _lens_values(file, frame)
+    if values.keys() >= _SIZE_KEYS:
         width, height = int(values["w"]), int(values["h"])
     else:
-        width, height = size_of(photograph_name(frame.file_path))
+        width, height = sizes_px[photograph_name(frame.file_path)]
     name = str(values.get("camera_model", "OPENCV")).upper()
     name = "OPENCV_FISHEYE" if values.get("is_fisheye") or name in _FISHEYES else name
     if name == _PANORAMA:

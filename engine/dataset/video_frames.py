@@ -2,8 +2,11 @@
 
 import json
 import math
+import os
+import shutil
 import subprocess
 import tempfile
+import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -65,16 +68,21 @@ def write_frames(video: Path, folder: Path, frames_per_second: float, on_step: O
         raise OutputError(
             f"{folder} holds something else than frames of {video.name} at that rate; remove or rename it."
         )
-    partial = folder.with_name(f".{folder.name}.partial")
+    # A name of its own, as another process may write frames of the video to the same folder.
+    partial = folder.with_name(f".{folder.name}.{os.getpid()}.{uuid.uuid4().hex[:8]}.partial")
     try:
-        (partial / "images").mkdir(parents=True, exist_ok=True)
-        for old in (partial / "images").iterdir():  # of a run that was interrupted
-            old.unlink()
+        (partial / "images").mkdir(parents=True)
         count = _write_sharpest(video, partial / "images", frames_per_second, on_step)
         write_json(partial / RECORD_FILE, record)
-        partial.rename(folder)
+        try:
+            partial.rename(folder)
+        except OSError:
+            if _read_record(folder) != record:  # another process was not first with the same frames
+                raise
     except OSError as error:
         raise OutputError(f"{folder} cannot be written ({error.strerror or error}).") from None
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
     return count
 
 

@@ -79,7 +79,7 @@ class _SizeClass:
     ) -> tuple[Float64[np.ndarray, "p k"], Int64[np.ndarray, "p k"]]:
         """Return ascending distances to the samples nearest to each point, and the samples' triangles."""
         count = min(CANDIDATES, len(self.owners))
-        apart, near = self.tree.query(points, k=count, workers=-1)
+        apart, near = self.tree.query(points, k=count, workers=threads_in_use())
         apart = np.maximum(apart.reshape(-1, count) - self.coarser, 0.0) if self.coarser else apart
         return apart.reshape(-1, count), self.owners[near.reshape(-1, count)]
 

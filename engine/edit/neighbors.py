@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
 from scipy.spatial import KDTree
 
+from octasplat.engine.core.threads import threads_in_use
 from octasplat.engine.gaussians.apply_legs import row_blocks
 
 NEIGHBOURS = 12
@@ -55,7 +56,7 @@ def neighbour_rotations(
     planar_sign = -1.0 if _is_reflection(everything)[0] else 1.0
     turns = np.empty((len(requested), 3, 3))
     for block in row_blocks(len(requested)):
-        _, near = tree.query(old_means[requested[block]], k=count, workers=-1)
+        _, near = tree.query(old_means[requested[block]], k=count, workers=threads_in_use())
         turns[block] = _orthogonal_fits(old_means[near], new_means[near], planar_sign)
         stray = _find_rim_gaussians(old_means[near], new_means[near], turns[block])
         turns[block][stray] = 0.0
@@ -150,7 +151,9 @@ def interpolate_motion(
     )
     for block in row_blocks(len(points)):
         part = points[block]
-        distances, near = (found.reshape(len(part), count) for found in tree.query(part, k=count, workers=-1))
+        distances, near = (
+            found.reshape(len(part), count) for found in tree.query(part, k=count, workers=threads_in_use())
+        )
         known, place = np.unique(near, return_inverse=True)
         derivatives = derivatives_of(known)[place.reshape(near.shape)]
         weights = _neighbor_weights(distances)
@@ -159,7 +162,7 @@ def interpolate_motion(
         carried.derivatives[block] = np.einsum("nk,nkij->nij", weights, derivatives)
         carried.unmoved[block] = unmoved[near].all(axis=1)
         if deleted_tree is not None:
-            carried.orphaned[block] = deleted_tree.query(part, workers=-1)[0] < distances[:, 0]
+            carried.orphaned[block] = deleted_tree.query(part, workers=threads_in_use())[0] < distances[:, 0]
     return carried
 
 

@@ -229,16 +229,18 @@ def _match_by_order(
 ) -> MatchedOctagons:
     expected = int((radii > 0).sum())
     count, rest = divmod(len(mesh), SIDES)
-    if rest or not 0 < count <= expected:
+    gids = np.zeros(0, np.int64)
+    if not rest and 0 < count <= expected:
+        # An export with a least opacity leaves the faintest out, and equally faint ones together.
+        faintest = np.sort(opacities[radii > 0])[expected - count]
+        gids = np.flatnonzero((radii > 0) & (opacities >= faintest))
+    if rest or count == 0 or len(gids) != count:
         raise SceneFileError(
             f"{path}: cannot be matched to the scene; its vertices carry no ids (attributes gid and corner), "
             f"and it has {len(mesh)} of them where {expected * SIDES} were exported. {EXPORT_ADVICE} "
             f"{OTHER_ORDER}"
         )
-    # An export with a least opacity leaves the faintest out.
-    faintest = np.sort(opacities[radii > 0])[expected - count]
-    gids = np.flatnonzero((radii > 0) & (opacities >= faintest))
-    if len(gids) != count or not _is_uv_in_order(mesh, radii[gids], radii):
+    if not _is_uv_in_order(mesh, radii[gids], radii):
         raise SceneFileError(
             f"{path}: cannot be matched to the scene; its vertices carry no ids (attributes gid and corner), "
             f"and their texture coordinates show that their order has changed. {EXPORT_ADVICE} "

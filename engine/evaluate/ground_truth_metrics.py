@@ -109,9 +109,8 @@ def fit_channel_scales(
         # Coarse steps first, as the error need not have a single valley.
         grid = np.linspace(-_OCTAVES, _OCTAVES, 65)
         near = grid[int(np.argmin([error(octaves) for octaves in grid]))]
-        found = minimize_scalar(
-            error, bounds=(near - 0.25, near + 0.25), method="bounded", options={"xatol": 1e-6}
-        )
+        bounds = max(near - 0.25, -_OCTAVES), min(near + 0.25, _OCTAVES)
+        found = minimize_scalar(error, bounds=bounds, method="bounded", options={"xatol": 1e-6})
         scales[channel] = 2.0 ** float(found.x)
     return scales
 

@@ -1,12 +1,12 @@
 """Scenes and meshes read from files of any known format."""
 
-import time
 from pathlib import Path
 
 import numpy as np
 
 from octasplat.engine.core.errors import SceneFileError
-from octasplat.engine.core.events import EventListener, PhaseFinished, PhaseStarted, ignore_events
+from octasplat.engine.core.events import EventListener, ignore_events
+from octasplat.engine.core.progress import phase
 from octasplat.engine.files.channel_columns import ChannelChoice
 from octasplat.engine.files.gaussian_ply import read_ply_metadata
 from octasplat.engine.files.glb_container import read_glb_origin
@@ -46,17 +46,14 @@ def read_scene(
     """
     source = _scene_file(path)
     importer = importer_for(source, format)
-    progress(PhaseStarted("read"))
-    began = time.monotonic()
-    if importer.read_channels is not None:
-        cloud = importer.read_channels(source, channels)
-    elif channels not in ("own", "all", ()):
-        raise SceneFileError(f"{source}: the format {importer.name} has no place for channels.")
-    else:
-        cloud = importer.read(source)
-    scene = flatten(cloud, source, drop_invalid=drop_invalid)
-    progress(PhaseFinished("read", time.monotonic() - began))
-    return scene
+    with phase("read", progress):
+        if importer.read_channels is not None:
+            cloud = importer.read_channels(source, channels)
+        elif channels not in ("own", "all", ()):
+            raise SceneFileError(f"{source}: the format {importer.name} has no place for channels.")
+        else:
+            cloud = importer.read(source)
+        return flatten(cloud, source, drop_invalid=drop_invalid)
 
 
 def read_metadata(path: Path) -> SceneMetadata:

@@ -77,8 +77,10 @@ def render_video(
     is complete; then they are removed, and the folder if it is empty.
 
     Raises:
-        OutputError: a file cannot be written.
+        OutputError: there are no shots, or a file cannot be written.
     """
+    if not shots:
+        raise OutputError(f"The video {film} has no frames; give at least one view.")
     *frames, unfinished = film_files(finished.folder, len(shots))
 
     def frame(number: int, _shot: Shot) -> Path:

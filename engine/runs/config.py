@@ -49,7 +49,9 @@ class ReconstructionConfig(RunSettings):
         if values.get("evaluation_background") is not None:
             return values
         train = values.get("train", {})
-        train_background = train.get("background") if isinstance(train, Mapping) else train.background
+        train_background = (
+            train.get("background") if isinstance(train, Mapping) else getattr(train, "background", None)
+        )
         # auto, random and learnt backgrounds are no fixed color
         return {**values, "evaluation_background": "white" if train_background == "white" else "black"}
 
@@ -191,10 +193,10 @@ def read_config(path: Path) -> ReconstructionConfig:
         ConfigError: the file is missing, damaged, or of another version.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        return _validate_config(
-            replace_former_names((ReconstructionConfig,), content["reconstruction"], source=str(path))
-        )
+        section = json.loads(path.read_text(encoding="utf-8"))["reconstruction"]
+        if not isinstance(section, Mapping):
+            raise TypeError("reconstruction is no object")
+        return _validate_config(replace_former_names((ReconstructionConfig,), section, source=str(path)))
     except InvalidSettingsError as error:  # not told as damage: the file is of another version
         raise ConfigError(f"{path} is not a configuration of this version: {error}") from None
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -1,6 +1,7 @@
 """What the displays show of the engine's events."""
 
 import io
+import json
 import re
 import time
 
@@ -10,12 +11,16 @@ from rich.console import Console
 from octasplat.engine.core.durations import format_clock, format_duration
 from octasplat.engine.core.errors import CancelledError
 from octasplat.engine.core.events import (
+    CheckpointWritten,
     HeldOutMeasured,
+    ImagesSaved,
     PhaseFinished,
     PhaseProgress,
     PhaseStarted,
+    RunFinished,
     TrainingProgress,
     Warned,
+    parse_event,
 )
 from octasplat.engine.core.progress import stop_when_asked
 from octasplat.workers.cli.progress import ProgressBars, show_progress
@@ -105,6 +110,14 @@ def test_should_stop_between_steps_cancels():
     assert len(heard) == 3
 
 
+def test_should_stop_between_stages_cancels():
+    heard = []
+    listen = stop_when_asked(heard.append, lambda: True)
+    listen(PhaseFinished("read", 0.5))
+    with pytest.raises(CancelledError, match="rendering"):
+        listen(PhaseStarted("render"))
+
+
 @pytest.mark.parametrize(
     ("shown", "expected"),
     [
@@ -123,3 +136,20 @@ def test_should_stop_between_steps_cancels():
 )
 def test_rate_is_formatted_with_suffix(shown, expected):
     assert shown == expected
+
+
+@pytest.mark.parametrize(
+    "event",
+    [
+        PhaseStarted("train", 5),
+        PhaseProgress("render", 1, 3, 0.5),
+        TRAINING,
+        CheckpointWritten(100, "a.npz"),
+        ImagesSaved(4),
+        Warned("a"),
+        RunFinished(("scene.ply", "report.json"), 12.5),
+    ],
+)
+def test_written_events_are_read_back(event):
+    content = json.loads(json.dumps(event.as_dict()))
+    assert parse_event(content.pop("kind"), content) == event

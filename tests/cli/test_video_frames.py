@@ -101,3 +101,15 @@ def test_videos_are_not_sent(octasplat, clip: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setenv("OCTASPLAT_SERVER", "http://127.0.0.1:9")
     refused = octasplat("submit", clip)
     assert refused.exit_code == 1 and "reconstruct takes a video" in refused.stderr
+
+
+def test_two_imports_to_one_folder_leave_each_other_alone(clip: Path, tmp_path: Path) -> None:
+    inner: list[int] = []
+
+    def import_too(_done: int, total: int) -> None:
+        if _done == total and not inner:
+            inner.append(write(clip, tmp_path / "frames"))
+
+    assert write_frames(clip, tmp_path / "frames", 1.0, import_too) == 3 and inner == [3]
+    assert len(list((tmp_path / "frames" / "images").iterdir())) == 3
+    assert [path.name for path in tmp_path.iterdir()] == ["frames"]

@@ -77,6 +77,29 @@ def test_pictures_saved_again_are_duplicates_where_the_pose_is_theirs(
         assert not _duplicate_sentences(_open(root, root))
 
 
+@pytest.mark.parametrize(
+    ("suffix", "full", "kind"),
+    [(".png", 1023, np.uint16), (".tif", 65535, np.float32), (".exr", 300, np.float32)],
+)
+def test_different_pictures_of_one_pose_are_no_duplicates_whatever_their_values_mean(
+    tmp_path: Path,
+    make_scene: Callable[..., Path],
+    save_image: Callable[..., None],
+    suffix: str,
+    full: float,
+    kind: type[np.generic],
+) -> None:
+    root = make_scene(
+        tmp_path / "scene",
+        images=[(f"{index}{suffix}", 0, None) for index in range(9)],
+        positions=lambda index: _ring(index % 8),
+    )
+    pictures = np.stack(_pictures(9)).astype(np.float64) / 255
+    for index, picture in enumerate(0.2 + 0.8 * pictures):
+        save_image(root / f"images/{index}{suffix}", np.rint(picture * full).astype(kind))
+    assert not _duplicate_sentences(_open(root, tmp_path))
+
+
 def test_a_duplicate_of_a_named_view_is_held_out(tmp_path: Path, make_scene: Callable[..., Path]) -> None:
     pictures = _pictures(4)
     images = [(f"{index}.png", 0, pictures[index % 4]) for index in range(8)]

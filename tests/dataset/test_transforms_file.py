@@ -3,7 +3,7 @@
 import json
 import math
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, KeysView
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import pytest
 
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.dataset import Dataset, DatasetModel, load_dataset_model
+from octasplat.engine.dataset.colmap_reading import load_model
 
 _COUNT = 5
 
@@ -267,3 +268,28 @@ def test_a_choice_between_models(scene: Path) -> None:
     assert len(chosen.views) == 4 and any("sparse/0 of 5 images" in sentence for sentence in chosen.warnings)
     with pytest.raises(DatasetError, match=r"holds no model sparse/7; there are sparse/0, transforms\.json"):
         load_dataset_model(scene, model="sparse/7")
+
+
+class _CountedSizes(dict[str, tuple[int, int]]):
+    """Sizes of photographs; counts the names that are looked through."""
+
+    seen = 0
+
+    def __iter__(self) -> Iterator[str]:
+        for name in super().__iter__():
+            self.seen += 1
+            yield name
+
+    def keys(self) -> KeysView[str]:
+        return KeysView(self)
+
+
+def test_sizes_are_found_in_one_search_for_all_photographs(tmp_path: Path) -> None:
+    names = [f"frame_{index:03d}" for index in range(60)]
+    pose = np.eye(4).tolist()
+    frames = [{"file_path": f"images/{name}", "transform_matrix": pose} for name in names]
+    path = _write(tmp_path, frames, fl_x=30.0)
+    sizes = _CountedSizes({f"{name}.PNG": (40 + index, 30) for index, name in enumerate(names)})
+    cameras = load_model(path, sizes).reconstruction.cameras
+    assert sorted(camera.width for camera in cameras.values()) == [40 + index for index in range(60)]
+    assert 0 < sizes.seen <= 10 * len(names)

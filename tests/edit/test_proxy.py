@@ -4,10 +4,13 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.core.threads import threads_in_use, use_threads
 from octasplat.engine.edit.deform import deform, deform_to, deformation_corners
 from octasplat.engine.edit.near_triangles import NearTriangles
+from octasplat.engine.edit.neighbors import interpolate_motion, neighbour_rotations
 from octasplat.engine.edit.proxy import MeanValueBinding, Proxy, bind_corners
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.spherical_harmonics import sh_basis
@@ -286,3 +289,32 @@ def test_proxy_nearest_triangle_with_uneven_density_is_found(size: float) -> Non
     on_floor = np.where(chosen >= len(facets), weights, 0.0).sum(axis=1)
     sure = np.abs(np.abs(to_ball) - points[:, 2]) > 0.2  # beyond where both are blended
     np.testing.assert_allclose(on_floor[sure], (np.abs(to_ball) > points[:, 2])[sure], atol=1e-6)
+
+
+def test_searches_take_no_more_threads_than_kernels_may(monkeypatch: pytest.MonkeyPatch) -> None:
+    random = np.random.default_rng(2)
+    points, corners = random.random((40, 3)), random.random((30, 3, 3))
+    taken: list[int] = []
+    query = KDTree.query
+
+    def watched(tree: KDTree, *args: object, workers: int = 1, **named: object) -> object:
+        taken.append(workers)
+        return query(tree, *args, workers=workers, **named)
+
+    monkeypatch.setattr(KDTree, "query", watched)
+    before = threads_in_use()
+    try:
+        use_threads(1)
+        NearTriangles(corners).query(points)
+        neighbour_rotations(points, points, np.arange(40))
+        interpolate_motion(
+            points,
+            points,
+            points,
+            lambda rows: np.zeros((len(rows), 3, 3)),
+            np.ones(40, bool),
+            points[:3] + 1,
+        )
+    finally:
+        use_threads(before)
+    assert len(taken) >= 4 and set(taken) == {1}

@@ -193,3 +193,11 @@ def test_relit_pictures_share_one_factor_a_channel():
     assert found["relight_scales"] == pytest.approx([2, 4, 1], rel=1e-3)
     assert found["relight_psnr"] < 25 and found["relight_psnr_scaled"] > 60
     assert set(found["relight"]) == {"day", "night"} and found["relight"]["day"]["views"] == 2
+
+
+@pytest.mark.parametrize("factor", [1e-4, 1e4])
+def test_channel_scales_stay_within_their_range(factor):
+    true = np.random.default_rng(0).random((100, 3))
+    scales = fit_channel_scales(true / factor, true, lambda values: values)
+    assert (scales >= 1 / 256).all() and (scales <= 256).all()
+    assert scales == pytest.approx(np.clip(factor, 1 / 256, 256), rel=1e-3)

@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 
 from octasplat.engine.core.errors import OutputError
+from octasplat.engine.render.resume import FinishedImages
+from octasplat.engine.render.series import render_video
 from octasplat.engine.render.video import VideoWriter
 
 COLORS = np.array(
@@ -76,3 +78,10 @@ def test_video_writer_unwritable_path_raises_output_error(tmp_path):
         pass
     with pytest.raises(OutputError, match="not open"):
         VideoWriter(tmp_path / "a.mp4", 30.0, 64, 48).write(frame(COLORS[0]))
+
+
+def test_video_of_no_views_is_refused(tmp_path):
+    finished = FinishedImages(tmp_path / "frames", "identity", resume=False)
+    with pytest.raises(OutputError, match=r"a\.mp4 has no frames"):
+        render_video((), tmp_path / "a.mp4", 30.0, lambda *_: None, finished, lambda *_: None)
+    assert list(tmp_path.glob("*.mp4")) == []
