@@ -45,7 +45,8 @@ def atomic_replace(path: Path) -> Iterator[Path]:
         try:
             yield temporary
             # Content before name: after a power failure the file is the old or the new one, never empty.
-            with temporary.open("rb") as handle:
+            # Open for writing, as Windows flushes no others.
+            with temporary.open("r+b") as handle:
                 os.fsync(handle.fileno())
             temporary.replace(path)
         finally:

@@ -111,7 +111,8 @@ def _hit_gradients(
     t_view_origin = np.where(has_viewer, t_view_origins, 0.0)[:, None]
     view = np.where(has_viewer[:, None], hits.to_mean - t_view_origin * directions, directions)
     length = np.linalg.norm(view, axis=1, keepdims=True)
-    view /= length
+    # a Gaussian right at the viewer is seen in no direction, as in the kernels, and has no gradient by it
+    view = np.divide(view, length, out=np.zeros_like(view), where=length > 0)
     sh = gaussians.sh[ids].astype(np.float64)
     color = 0.5 + np.einsum("hk,hkc->hc", sh_basis(view, gaussians.sh_degree), sh)
     # a channel clamped at zero has no gradient
@@ -119,7 +120,8 @@ def _hit_gradients(
     grad_unit_view = np.einsum(
         "hki,hkc,hc->hi", sh_basis_gradients(view, gaussians.sh_degree), sh, grad_color
     )
-    grad_view = (grad_unit_view - (grad_unit_view * view).sum(axis=1, keepdims=True) * view) / length
+    across = grad_unit_view - (grad_unit_view * view).sum(axis=1, keepdims=True) * view
+    grad_view = np.divide(across, length, out=np.zeros_like(view), where=length > 0)
 
     # --- the gradient with respect to the hit's weight: what it brings for each unit of that ---
     cosine_to_mean = np.einsum("hi,hi->h", hits.to_mean, normals) / np.linalg.norm(hits.to_mean, axis=1)

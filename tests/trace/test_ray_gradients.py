@@ -104,6 +104,20 @@ def test_moving_all_rays_is_moving_all_gaussians_back(rng: np.random.Generator) 
     )
 
 
+def test_gaussian_right_at_the_viewer_has_the_gradient_of_the_kernels(rng: np.random.Generator) -> None:
+    cloud = replace(
+        make_cloud(rng, 1, degree=2, size=0.5, logits=(0.5, 1.0)), means_world=f32([[0.0, 0.0, 1.0]])
+    )
+    rays = RayBatch(f32([[0.0, 0.0, 0.0]]), f32([[0.0, 0.0, 1.0]]), t_view_origin=np.ones(1, np.float32))
+    tracer = make_tracer(cloud)
+    seen = tracer.trace(rays, record=True)
+    assert seen.recording is not None and seen.transmittance[0] < 1
+    given = random_gradients(rng, 1)
+    ours = ray_gradients(cloud, rays, seen.recording, given, tracer.settings)
+    moved = tracer.backward(seen.recording, given).means_world
+    np.testing.assert_allclose(ours.origins_world, -moved, rtol=2e-3, atol=1e-5)
+
+
 @pytest.mark.usefixtures("both_ways")
 def test_hits_by_ray_are_those_of_each_ray(rng: np.random.Generator) -> None:
     cloud = make_cloud(rng, 200)

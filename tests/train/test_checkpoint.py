@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 
 from octasplat.engine.core.errors import CheckpointError
+from octasplat.engine.core.events import Event, Warned
 from octasplat.engine.gaussians.rows import row_arrays
 from octasplat.engine.train.loop.checkpoint import (
     BestState,
     latest_checkpoint,
     load_best,
     load_checkpoint,
+    load_latest_checkpoint,
     save_best,
     save_checkpoint,
 )
@@ -94,6 +96,18 @@ def test_damage_is_refused_or_harmless(tmp_path: Path) -> None:
             back.rng.bit_generator.state["state"], state.rng.bit_generator.state["state"]
         )
     assert refused > 100
+
+
+def test_damaged_checkpoint_is_removed_and_nothing_is_asked_of_the_user(tmp_path: Path) -> None:
+    save_checkpoint(make_state(10), tmp_path, "abc")
+    path = save_checkpoint(make_state(20), tmp_path, "abc")
+    path.write_bytes(b"no archive")
+    heard: list[Event] = []
+    state = load_latest_checkpoint(tmp_path, "abc", heard.append)
+    assert state is not None and state.iteration == 10 and not path.exists()
+    (warning,) = heard
+    assert isinstance(warning, Warned) and f"{path} is damaged" in warning.message
+    assert "delete" not in warning.message and "the one before it is taken" in warning.message
 
 
 def test_checkpoint_missing_file_is_named(tmp_path: Path) -> None:

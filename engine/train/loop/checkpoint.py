@@ -118,7 +118,7 @@ def load_checkpoint(path: Path, fingerprint: str) -> TrainState:
         groups = _group_arrays(arrays)
     except _DAMAGE as error:
         raise DamagedCheckpointError(
-            f"{path} is damaged ({error}); delete it to go on from the one before it."
+            f"{path} is damaged ({error}); the one before it is taken, or the run begins anew."
         ) from None
     rng = np.random.Generator(np.random.PCG64())
     rng.bit_generator.state = meta["rng"]
