@@ -10,7 +10,12 @@ from jaxtyping import Float64
 from octasplat.engine.core.errors import ConfigError, DatasetError
 from octasplat.engine.core.local_origin import Origin, describe_origin, is_set
 from octasplat.engine.core.relative_paths import normalize_name
-from octasplat.engine.core.scene_layout import is_photograph, left_out_sentences, masks_beside
+from octasplat.engine.core.scene_layout import (
+    MIN_PHOTOGRAPHS,
+    is_photograph,
+    left_out_sentences,
+    masks_beside,
+)
 from octasplat.engine.dataset.camera import Camera
 from octasplat.engine.dataset.colmap_model import ColmapModel, PosedImage, read_colmap_model
 from octasplat.engine.dataset.image_info import ImageInfo
@@ -22,9 +27,6 @@ from octasplat.engine.dataset.model_sources import find_model, has_model, other_
 from octasplat.engine.dataset.photograph_files import files_below, image_folder, photographs_below
 from octasplat.engine.dataset.views_file import capped_size
 
-MIN_VIEWS = 3
-"""Fewer photographs than this do not make a scene."""
-
 
 def load_dataset_model(
     root: Path,
@@ -32,7 +34,7 @@ def load_dataset_model(
     max_side: int | None = None,
     model_folder: Path | None = None,
     model: str | None = None,
-    min_views: int = MIN_VIEWS,
+    min_views: int = MIN_PHOTOGRAPHS,
     for_training: bool = True,
     origin_world: Origin | None = None,
 ) -> DatasetModel:

@@ -97,7 +97,7 @@ class ViewGroundTruth:
     Attributes:
         mask: where the scene is seen.
         normal_world: unit vectors that face the camera, 0 outside the mask.
-        depth_z: along the camera's axis, world units, 0 outside the mask.
+        depth_z: along the camera's axis, world units, as in the file outside the mask.
         albedo_linear: base color.
         roughness: perceptual.
         metallic: share of the metal.

@@ -213,7 +213,7 @@ def build_request(
         place: what users call the field at a path with dots, such as ``--max-side`` for ``max_side``.
 
     Raises:
-        ContradictoryRequest: the values do not go together, or something is missing; one sentence.
+        ContradictoryRequestError: the values do not go together, or something is missing; one sentence.
         ConfigError: a name is unknown, or a value is out of range; one sentence.
     """
     try:

@@ -217,7 +217,7 @@ class Film:
 
 
 def apply_tone_curve(linear: Float64[np.ndarray, "n 3"], tone: ToneCurve) -> Float64[np.ndarray, "n 3"]:
-    """Return linear values mapped to [0, 1] by a tone curve.
+    """Return linear values under a tone curve; only ``filmic`` limits them to [0, 1].
 
     ``reinhard`` divides by 1 plus luminance ("Photographic Tone Reproduction", Reinhard et al. 2002);
     ``filmic`` is a fit of ACES' reference curve (https://knarkowicz.wordpress.com, "ACES Filmic Tone Mapping

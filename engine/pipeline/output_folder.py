@@ -117,6 +117,6 @@ def _check_settings(scene: Path, output: Path, config: ReconstructionConfig) -> 
 
 
 def _normalize_config(config: ReconstructionConfig, is_posed: bool) -> ReconstructionConfig:
-    """Return settings normalize_name, so that equal meanings compare equal."""
+    """Return settings in one spelling, so that equal meanings compare equal."""
     held_out = None if config.held_out is None else tuple(sorted(map(normalize_name, config.held_out)))
     return config.with_poses_decided(is_posed).model_copy(update={"held_out": held_out})

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from octasplat.engine.core.errors import OutputError
 
-_LOCKED_MESSAGE = frozenset({errno.EAGAIN, errno.EACCES})
+_LOCKED_ERRORS = frozenset({errno.EAGAIN, errno.EACCES})
 
 
 @contextmanager
@@ -26,7 +26,7 @@ def lock_run_folder(output: Path) -> Iterator[None]:
         try:
             fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            if error.errno in _LOCKED_MESSAGE:  # any other error: a file system without locks
+            if error.errno in _LOCKED_ERRORS:  # any other error: a file system without locks
                 raise OutputError(
                     f"Another octasplat works on the run in {output}; wait for it or stop it, or name "
                     "another folder."

@@ -96,8 +96,7 @@ class PoseSearchRequest(BaseModel):
     """Request to the process in which COLMAP runs.
 
     With ``given`` see :mod:`octasplat.engine.poses.pose_repair`; with the folder of a model, ``lenses_of``,
-    see
-    :mod:`octasplat.engine.poses.principal_points`; without either
+    see :mod:`octasplat.engine.poses.principal_points`; without either
     :class:`octasplat.engine.poses.search.PoseSearch`.
     """
 

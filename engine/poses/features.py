@@ -33,7 +33,7 @@ OnCount = Callable[[int], None]
 _PHOTOGRAPHS_PER_BATCH = 4
 _PAIRS_PER_BATCH = 64
 _PRESELECTION_PAIRS_PER_BATCH = 2048
-_MIN_PRESELECTION_PHOTOGRAPHS = 4
+_MIN_PRESELECTION_INLIERS = 4
 _RELAXED_MATCH_RATIO = 0.9
 """A match may be so near in distance to the second best one; otherwise 0.8."""
 
@@ -184,7 +184,7 @@ def preselect_pairs(
     options.skip_geometric_verification = True
     # the quick look needs no geometry, only counts
     verification = pycolmap.TwoViewGeometryOptions()
-    verification.min_num_inliers = _MIN_PRESELECTION_PHOTOGRAPHS
+    verification.min_num_inliers = _MIN_PRESELECTION_INLIERS
     alike: dict[Pair, int] = {}
     looked = unlike = 0
     for some in batch_pairs(all_pairs(len(names)), _PRESELECTION_PAIRS_PER_BATCH):

@@ -74,8 +74,6 @@ def _adjust_shared_principal_point(given: Any) -> tuple[Any | None, float]:
     """Return the model bundle-adjusted with the given lenses, and its mean error (px); None where it fails.
 
     It is the baseline: an improvement that it already reaches is not due to the lenses.
-
-    What is gained so is not the lenses' doing.
     """
     if any(len(frame.data_ids) > 1 for frame in given.frames.values()):
         return None, 0.0

@@ -122,7 +122,10 @@ def _conjugate_gradients(
     steps: int,
     on_pass: Callable[[int, int], None],
 ) -> Float64[np.ndarray, "n 3"]:
-    """Take steps towards the minimum of |W c - y|^2 + HELD |c - start|^2, each channel on its own."""
+    """Take steps towards the minimum of |W c - y|^2 + r |c - start|^2, each channel on its own.
+
+    r is :data:`REGULARISATION`.
+    """
     scale = (weights + REGULARISATION)[:, None]  # preconditioner: about the diagonal of W^T W
     colors = start.copy()
     rest = -normal(colors, targets)

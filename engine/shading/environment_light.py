@@ -22,9 +22,6 @@ class EnvironmentLight:
     the new one takes as long as tracing a batch.
 
     Args:
-        settings: its size, rate and priors.
-
-    Args:
         height: texels from up to down; there are twice as many around.
         hdr: whether the radiance may be more than 1.
         white_weight: weight of the distance of the colors to grey.

@@ -57,9 +57,9 @@ class SplitSumRelighter:
         self._tracer = make_tracer(settings, threads=threads, build_quality=2)
         self._tracer.build(self._gaussians, self._shading.features(self._gaussians))
         self._all = np.arange(len(gaussians))
-        self._ambient_visibility: Float32[np.ndarray, " n"] | None = None
+        self._open_sides: Float32[np.ndarray, " n"] | None = None
         if AMBIENT in gaussians.channels and shading.ambient_occlusion:
-            self._ambient_visibility = self._shading.measure_ambient_occlusion(
+            self._open_sides = self._shading.measure_ambient_occlusion(
                 self._gaussians, self._all, self._tracer
             )
         self._radiance: Float32[np.ndarray, "h w 3"] | None = None
@@ -72,9 +72,9 @@ class SplitSumRelighter:
             self._radiance = environment.radiance_linear
         if other or not np.array_equal(self._shading.frame, environment.frame):
             self._shading.frame = environment.frame
-            if self._ambient_visibility is not None:
+            if self._open_sides is not None:
                 self._shading.measure_diffuse_interreflection(
-                    self._gaussians, self._all, self._ambient_visibility, self._tracer
+                    self._gaussians, self._all, self._open_sides, self._tracer
                 )
 
     def render(self, image: ImageRays, progress: ProgressCallback = no_progress) -> RelitImage:

@@ -29,10 +29,10 @@ class CorrectedDataset:
     Views of no correction keep every bit of their rays.
 
     Args:
-        original: the photographs as they are.
+        given: the photographs as they are.
 
     Attributes:
-        original: those.
+        original: the given photographs.
         views: with the poses as they are corrected.
     """
 
@@ -101,7 +101,7 @@ def remove_common_motion(
     it. Views of no correction have a say in what is common, but stay.
 
     Args:
-        corrections: see :meth:`CorrectedDataset.put`.
+        corrections: see :meth:`CorrectedDataset.set_corrections`.
         dataset: the photographs with their given poses.
         used: views that could be corrected.
     """

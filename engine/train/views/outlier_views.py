@@ -151,14 +151,12 @@ def _neighborhood_median(
     total = len(origins)
     rows = max(1, MAX_DISTANCES // total)
     sample = np.unique(np.linspace(0, total - 1, min(rows, total)).astype(np.int64))
-    usual_distance = max(float(np.median(_squared_distances(origins[sample], origins))), 1e-12)
+    usual_distance = max(float(np.median(_distances(origins[sample], origins))), 1e-12)
     neighbor_count = min(NEIGHBORS, int(counts.sum()) - 1)
     result = np.empty(total)
     for start in range(0, total, rows):
         part = slice(start, start + rows)
-        distances = _squared_distances(origins[part], origins) / usual_distance + (
-            1 - forward[part] @ forward.T
-        )
+        distances = _distances(origins[part], origins) / usual_distance + (1 - forward[part] @ forward.T)
         distances[:, ~counts] = np.inf
         # a view is not its own neighbor
         distances[np.arange(len(distances)), np.arange(total)[part]] = np.inf
@@ -167,7 +165,7 @@ def _neighborhood_median(
     return result
 
 
-def _squared_distances(
+def _distances(
     some: Float64[np.ndarray, "s 3"], others: Float64[np.ndarray, "v 3"]
 ) -> Float64[np.ndarray, "s v"]:
     return np.asarray(np.linalg.norm(some[:, None] - others, axis=2))

@@ -2,11 +2,11 @@
 
 Between iterations each training view is aligned with what the Gaussians show from there (see
 :mod:`octasplat.engine.train.views.image_alignment`); rays are then made from the corrected poses, and both
-come nearer by
-turns. What all corrections have in common is taken out, so that held-out views, which keep the poses that are
-given, stay in their places. Poses that are wrong by more than some pixels are not found: steps are small, and
-nothing is looked for. The first Gaussians, camera clearance, least scales, meshes and renders "as the
-photographs" use the poses that are given, and so do later commands; ``training.json`` has the corrected ones.
+come nearer by turns. What all corrections have in common is taken out, so that held-out views, which keep the
+poses that are given, stay in their places. Poses that are wrong by more than some pixels are not found: steps
+are small, and nothing is looked for. The first Gaussians, camera clearance, least scales, meshes and renders
+"as the photographs" use the poses that are given, and so do later commands; ``training.json`` has the
+corrected ones.
 """
 
 from collections.abc import Iterator
