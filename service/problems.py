@@ -276,7 +276,8 @@ def _distinct(faults: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _field_error(prefix: str, fault: Mapping[str, Any]) -> dict[str, Any]:
-    if fault["loc"][:1] == ("stage",):  # told as whoever reads a stage file would be told
+    is_unknown = fault["type"] == "extra_forbidden" and len(fault["loc"]) == 1  # of a kind without stages
+    if fault["loc"][:1] == ("stage",) and not is_unknown:  # told as whoever reads a stage file would be told
         keys, message = stage_error({**fault, "loc": fault["loc"][1:]}, ("stage",))
         fault = {**fault, "loc": keys, "msg": message}
     where, *path = fault["loc"] or ("",)

@@ -52,7 +52,7 @@ def elsewhere() -> Iterator[str]:
 def test_scene_at_an_address_is_fetched_checked_and_queued(
     conninfo: str, tmp_path: Path, elsewhere: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with FrontEnd(conninfo, tmp_path, OCTASPLAT_WEBHOOK_HOSTS="127.0.0.1") as front:
+    with FrontEnd(conninfo, tmp_path, OCTASPLAT_IMPORT_HOSTS="127.0.0.1") as front:
         monkeypatch.setenv("OCTASPLAT_SERVER", front.address)
         monkeypatch.setenv("OCTASPLAT_TOKEN", front.token)
         url = f"{elsewhere}/fox.zip?key=1"
