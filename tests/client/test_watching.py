@@ -36,13 +36,15 @@ def test_watch_job_survives_long_outage(monkeypatch: pytest.MonkeyPatch) -> None
     server = serving(("127.0.0.1", 0))
     host, port = server.server_address[0], server.server_address[1]
     found: list[str] = []
+    heard = threading.Event()  # a service that never answered is not waited for
     with api.Api(f"http://127.0.0.1:{port}") as client:
 
         def watch() -> None:
-            found.append(watch_job(client, "x", lambda _event: None, lambda _state: None)["state"])
+            found.append(watch_job(client, "x", lambda _event: None, lambda _state: heard.set())["state"])
 
         watching = threading.Thread(target=watch, daemon=True)
         watching.start()
+        assert heard.wait(30)
         server.shutdown()
         server.server_close()
         time.sleep(2.5)

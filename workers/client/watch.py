@@ -46,21 +46,23 @@ def watch_job(
     patience = Backoff(MAX_OUTAGE_SECONDS)
     while True:
         try:
-            for kind, data, number in _read_events(api, job_id, last):
-                last = number
-                patience.reset()
-                _dispatch(kind, data, on_event, on_state)
+            try:
+                for kind, data, number in _read_events(api, job_id, last):
+                    last = number
+                    patience.reset()
+                    _dispatch(kind, data, on_event, on_state)
+            except ServiceError as error:
+                if error.status not in BUSY_STATUSES | UNAVAILABLE_STATUSES:
+                    raise
+                time.sleep(_BUSY_SECONDS)  # it has enough streams, so that the job is asked for now and then
+            # The service may go away between the end of the stream and this answer, too.
+            job: dict[str, Any] = api.get(f"/v1/jobs/{job_id}")
         except (httpx.TransportError, ServiceUnreachableError) as error:
             if not patience.wait():
                 raise (
                     error if isinstance(error, ServiceUnreachableError) else api.unreachable_error(error)
                 ) from None
             continue
-        except ServiceError as error:
-            if error.status not in BUSY_STATUSES | UNAVAILABLE_STATUSES:
-                raise
-            time.sleep(_BUSY_SECONDS)  # it has enough streams, so that the job is asked for now and then
-        job: dict[str, Any] = api.get(f"/v1/jobs/{job_id}")
         if job["state"] in TERMINAL:
             return job
         time.sleep(_POLL_SECONDS)
