@@ -79,6 +79,8 @@ class TrainStep:
 
 
 def _train(run: ReconstructionRun, clock: PhaseClock) -> FlatGaussians:
+    if not any((run.output / CHECKPOINTS).glob("*.npz")):
+        _warn_of_useless_materials(run)  # before the plan, which shares out what is left of the time
     config = _plan_settings(
         dataset=run.dataset,
         output=run.output,
@@ -112,7 +114,6 @@ def _make_trainer(
     fingerprint = run_fingerprint(dataset, config)
     state = load_latest_checkpoint(folder, fingerprint, progress)
     if state is None:
-        _warn_of_useless_materials(run, config)  # before the first Gaussians, which take long
         state = initial_train_state(dataset, config, threads=use_threads(run.threads))
         if exposure_changes is not None:
             progress(Warned(f"{exposure_changes} That is learnt; exposure=false leaves it out."))
@@ -142,8 +143,9 @@ def _make_trainer(
     return trainer
 
 
-def _warn_of_useless_materials(run: ReconstructionRun, config: TrainConfig) -> None:
+def _warn_of_useless_materials(run: ReconstructionRun) -> None:
     """Warn before a long training whose photographs plain colors explain better than materials do."""
+    config = run.config.train
     steps = iteration_count(config, run.dataset.train_pixel_count, valid_pixel_fraction(run.dataset))
     if (
         not config.materials.learn
@@ -238,8 +240,10 @@ def _plan_settings(
     if settings.minutes is None:
         return config
     if not (output / PLAN).exists():
+        began = clock.seconds()
         first = initial_train_state(dataset, config, threads=use_threads(threads)).gaussians
-        left = 60 * settings.minutes - 2 * clock.seconds()  # the first Gaussians are made once more
+        now = clock.seconds()
+        left = 60 * settings.minutes - now - (now - began)  # the first Gaussians are made once more
         plan = make_plan(dataset, config, first, seconds=left, threads=threads, should_stop=should_stop)
         write_plan(output / PLAN, plan)
     # read back, so that a run that goes on has the very same numbers

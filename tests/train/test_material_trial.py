@@ -1,6 +1,8 @@
 """Whether materials are of use is judged by two short trainings, before a long one."""
 
+import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -8,6 +10,7 @@ from octasplat.engine.core.events import Event, Noted, Warned
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.pipeline import reconstruct, train_step
 from octasplat.engine.runs.config import resolve_config
+from octasplat.engine.train.loop.time_budget import TimeBudgetPlan, make_plan
 from octasplat.engine.train.loop.trial_training import material_gain_db
 from tests.support.tiny_dataset import make_tiny_dataset
 
@@ -38,3 +41,28 @@ def test_long_training_with_useless_materials_is_warned_of(
     assert any(isinstance(event, Noted) and "short trainings" in event.message for event in events) == (
         share == 0
     )
+
+
+def test_time_of_the_trial_is_part_of_the_minutes(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seconds: list[float] = []
+    planned = make_plan
+
+    def slow_trial(*_arguments: object, **_named: object) -> float:
+        time.sleep(3.0)
+        return 0.0
+
+    def note(*arguments: Any, **named: Any) -> TimeBudgetPlan:
+        seconds.append(named["seconds"])
+        plan = planned(*arguments, **named)
+        return plan.model_copy(update={"iterations": 2, "max_gaussians": 100})
+
+    monkeypatch.setattr(train_step, "material_gain_db", slow_trial)
+    monkeypatch.setattr(train_step, "LONG_TRAINING_TRIALS", 0)
+    monkeypatch.setattr(train_step, "make_plan", note)
+    few = ["rays_per_batch=64", "initial_points=50", "test_every=4"]
+    settings = {"exports": (), "minutes": 0.5}
+    config = resolve_config("fast", settings=settings, materials=True, assignments=few)
+    reconstruct(scene, tmp_path / "run", config, threads=1)
+    assert 20 < seconds[0] <= 27
