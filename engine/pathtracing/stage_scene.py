@@ -12,8 +12,8 @@ from octasplat.engine.core.local_origin import NO_ORIGIN, Origin, is_set
 from octasplat.engine.dataset.model import Viewpoints
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.pathtracing.stage.stage_file import StageLayout
+from octasplat.engine.pathtracing.stage_layout import estimate_stage_layout
 from octasplat.engine.pathtracing.stage_origin import places_note
-from octasplat.engine.pathtracing.stage_placement import estimate_stage_layout
 from octasplat.engine.render.pose_paths import Turntable
 from octasplat.engine.render.shots import gaussian_turntable, turntable_of_views
 from octasplat.engine.trace.factory import make_tracer
