@@ -111,7 +111,9 @@ class Upheavals:
 
     def end_front_end(self, *, kindly: bool) -> None:
         """End the front end, which is started again."""
-        ended = self.machine.front_end()
+        deadline = time.monotonic() + COMMAND_SECONDS
+        while not (ended := self.machine.front_end()) and time.monotonic() < deadline:
+            time.sleep(0.05)  # it has just been ended, and is being started again
         for process in ended:
             process.terminate() if kindly else process.kill()
         self.front_ends_ended += len(ended)

@@ -107,4 +107,5 @@ async def test_every_kind_of_job_succeeds_in_its_own_process(
         await run("import", {"file": "a.ply"}, None, a__ply=scene)
         log = (await http.get(f"/v1/jobs/{whole}/logs")).json()
         assert "PermissionError" not in json.dumps(log)
-    assert done == {kind.name for kind in job_kinds()} - {"toy"}
+    # Other tests of the same process register kinds of their own.
+    assert done == {kind.name for kind in job_kinds() if kind.program.startswith("octasplat.")}
