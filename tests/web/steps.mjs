@@ -258,6 +258,19 @@ const steps = {
         await shot(page, "live_points");
         await counted("Step 30");
         await page.waitForSelector("#viewer[data-rested=yes]");
+        // One change is one drawing of the lines over the scene, however many frames pass until the camera rests.
+        found.overlayDraws = await page.evaluate(async () => {
+            const own = CanvasRenderingContext2D.prototype.clearRect, { dataset } = document.querySelector("#viewer");
+            let draws = 0;
+            CanvasRenderingContext2D.prototype.clearRect = function (...sides) { draws += 1; own.apply(this, sides); };
+            const next = (until) => new Promise((resolve) => { const look = () => (until() ? resolve() : requestAnimationFrame(look)); look(); });
+            document.querySelector("#viewer [data-do=background]").click();
+            await next(() => dataset.rested === "no");
+            await next(() => dataset.rested === "yes" && dataset.drawn === "all");
+            CanvasRenderingContext2D.prototype.clearRect = own;
+            return draws;
+        });
+        await page.click("#viewer [data-do=background]");
         found.count = await page.textContent("#viewer .count");
         found.views = await page.locator("#viewer .views option").allTextContents();
         found.unplaced = [await page.textContent("#viewer .unplaced summary"), ...await page.locator("#viewer .unplaced li").evaluateAll((items) => items.map((item) => item.textContent))];

@@ -86,6 +86,7 @@ def test_training_is_watched_in_3d(
         f"{name} (held out)" for name in held_out
     ]
     assert found["unplaced"] == ["1 photograph was not placed", "without a place.png"]
+    assert found["overlayDraws"] == 1
     assert found["marks"][0] == 0 < found["marks"][1]
     assert found["place"] == f"{held_out[0]} (held out)"
     photograph = found["photograph"]

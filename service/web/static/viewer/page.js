@@ -25,6 +25,7 @@ class Viewer extends LoadingViewer {
         this.q = Number(box.dataset.q) || CHI2_2_99;
         this.background = box.dataset.background in BACKGROUNDS ? box.dataset.background : "black";
         this.isStale = true; // what is shown is not what the camera sees
+        this.isOverlayStale = true;
         this.movedAt = 0;
         this.lastFrame = 0;
         this.isBusy = false; // with a picture, or a part of one
@@ -192,7 +193,7 @@ class Viewer extends LoadingViewer {
             this.isOrderWhole = limit === Infinity && !this.sorting.wanted;
             this.isStale = true;
             this.added = null;
-            this.box.dataset.ready = "yes";
+            Object.assign(this.box.dataset, { ready: "yes", drawn: "part" });
             this.veil.hidden = true;
         });
         this.scene = scene;
@@ -336,10 +337,10 @@ class Viewer extends LoadingViewer {
     }
 
     wake() {
-        this.isStale = true;
+        this.isStale = this.isOverlayStale = true;
         this.added = null;
         this.movedAt = performance.now();
-        this.box.dataset.rested = "no";
+        Object.assign(this.box.dataset, { rested: "no", drawn: "part" });
     }
 
     /** Moves the camera and draws; nothing is asked for while the picture before is not there. */
@@ -351,7 +352,8 @@ class Viewer extends LoadingViewer {
         if (!this.walking.flying) this.controls.update();
         this.limits.clampTarget(this.controls.target);
         if (this.limits.clamp(this.camera.position) && !this.walking.flying) this.camera.lookAt(this.controls.target);
-        if (this.isStale) this.drawOverlay();
+        // Once for each change: a page that changes in every frame leaves a software renderer no time for the scene.
+        if (this.isOverlayStale) this.drawOverlay();
         if (this.isBusy || !this.isStale) return;
         this.camera.updateMatrixWorld();
         if (performance.now() - this.movedAt < REST_MS) this.drawMoving();
@@ -366,6 +368,7 @@ class Viewer extends LoadingViewer {
             this.photograph.leave();
         }
         this.overlay.draw(this.camera);
+        this.isOverlayStale = false;
     }
 
     /** Draws the heaviest Gaussians with fewer pixels, as many as there is time for. */
@@ -383,13 +386,13 @@ class Viewer extends LoadingViewer {
         });
     }
 
-    /** Draws all Gaussians, part by part, and shows them together. */
+    /** Draws all Gaussians, part by part, and shows them together: first with as few pixels as while moving, then with all. */
     drawResting() {
         this.sort(Infinity);
         if (!this.isOrderWhole) return;
         if (this.added === null) {
             this.added = 0;
-            this.splats.scale = 1;
+            this.splats.scale = this.box.dataset.drawn === "all" ? 1 : this.pacing.scale;
             this.splats.begin();
         }
         const count = Math.min(this.pacing.slice, this.splats.ordered - this.added);
@@ -397,8 +400,12 @@ class Viewer extends LoadingViewer {
         this.added += count;
         if (this.added >= this.splats.ordered) {
             this.splats.show(this.camera);
-            this.isStale = false;
-            this.box.dataset.rested = "yes";
+            this.box.dataset.drawn = "all";
+            if (this.splats.scale < 1) this.added = null; // sharper next, which may take a slow device long
+            else {
+                this.isStale = false;
+                this.box.dataset.rested = "yes";
+            }
         }
         this.wait((milliseconds) => { if (count === this.pacing.slice) this.pacing.noteSlice(milliseconds); });
     }
