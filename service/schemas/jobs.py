@@ -210,6 +210,7 @@ class JobView(JobSummary):
                     "files_id": None,
                     "label": "fox, first try",
                     "options": {"preset": "fast"},
+                    "requested": {"preset": "fast"},
                     "resolved_by": "0.1.0",
                     "queue": "cpu",
                     "priority": 0,
@@ -253,6 +254,11 @@ class JobView(JobSummary):
     view_notes: list[ViewNote] = Field([], description="What people wrote at places of the 3D view.")
     options: dict[str, Any] = Field(
         description="Every setting: as resolved where the job ran, or as this version would resolve it."
+    )
+    requested: dict[str, Any] | None = Field(
+        None,
+        description="The options that were asked for, under their present names; null for jobs of versions "
+        "that kept only the resolved ones.",
     )
 
 

@@ -60,7 +60,7 @@ async def test_job_is_stored_as_asked_and_shown_complete(connect_service: Connec
     async with connect_service() as (http, service):
         job = await new_job(http, service, options={"steps": 3})
         assert job["options"]["steps"] == 3 and len(job["options"]) == len(ToyOptions.model_fields)
-        assert job["resolved_by"] is None
+        assert job["requested"] == {"steps": 3} and job["resolved_by"] is None
         async with service.pool.connection() as connection:
             query = "SELECT options, requested FROM jobs WHERE id = %s"
             row = await (await connection.execute(query, [job["id"]])).fetchone()
