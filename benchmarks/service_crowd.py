@@ -152,6 +152,8 @@ async def crowd(
 
         began = time.perf_counter()
         await asyncio.gather(*(queue(number) for number in range(options.jobs)))
+        found["slowest_submission_ms"] = round(max(value for load in loads for value in load.milliseconds), 1)
+        found["submissions_put_off"] = sum(load.put_off for load in loads)
         found["queue_seconds"] = round(time.perf_counter() - began, 1)
         ready = [asyncio.Event() for _ in range(options.streams)]
         began = time.perf_counter()

@@ -43,13 +43,20 @@ class Load:
         self.milliseconds: list[float] = []
         self.events = 0
         self.ended = 0
+        self.put_off = 0
+        """How often an answer asked for patience."""
 
     async def ask(self, method: str, path: str, **arguments: Any) -> Any:
-        """The JSON of an answer."""
+        """The JSON of an answer; one that asks for patience is asked for again when it says."""
         async with self._turn:
-            began = time.perf_counter()
-            response = await self._http.request(method, path, **arguments)
-            self.milliseconds.append(1000 * (time.perf_counter() - began))
+            while True:
+                began = time.perf_counter()
+                response = await self._http.request(method, path, **arguments)
+                self.milliseconds.append(1000 * (time.perf_counter() - began))
+                if response.status_code not in (429, 503):
+                    break
+                self.put_off += 1
+                await asyncio.sleep(float(response.headers["Retry-After"]))
         response.raise_for_status()
         return response.json()
 
