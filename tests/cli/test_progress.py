@@ -51,10 +51,19 @@ def test_plain_lines_are_rate_limited():
     lines = []
     show = EventLines(lines.append, interval_seconds=0.2)
     show(PhaseStarted("load", 100))
-    end = time.monotonic() + 0.5
-    while time.monotonic() < end:
-        show(PhaseProgress("load", 7, 100))
-    assert lines == ["Loading", "  7/100", "  7/100"]
+    begun = time.monotonic()
+    for step in (7, 8, 9):
+        while time.monotonic() < begun + 0.25 * (step - 6):
+            show(PhaseProgress("load", step, 100))
+    assert [line.partition(",")[0] for line in lines[1:]] == ["  7/100", "  8/100", "  9/100"]
+
+
+def test_plain_lines_are_not_repeated():
+    lines = []
+    show = EventLines(lines.append, interval_seconds=0.0)
+    for event in (PhaseStarted("export", 5), *3 * [PhaseProgress("export", 0, 5)]):
+        show(event)
+    assert lines == ["Exporting", "  0/5"]
 
 
 def test_warnings_go_to_stderr(capsys):

@@ -111,6 +111,7 @@ class EventLines:
         self._write_note = note or write
         self._interval_seconds = interval_seconds
         self._next_at = 0.0
+        self._last = ""
         self._state = ProgressState()
 
     def __call__(self, event: Event) -> None:
@@ -118,7 +119,7 @@ class EventLines:
         self._state.update(event)
         if isinstance(event, PhaseStarted):
             self._write(PHASE_TITLES.get(event.stage, event.stage))
-            self._next_at = time.monotonic() + self._interval_seconds
+            self._next_at, self._last = time.monotonic() + self._interval_seconds, ""
         elif isinstance(event, PhaseFinished):
             self._write(self._state.finished_line(event))
         elif isinstance(event, Warned):
@@ -126,8 +127,11 @@ class EventLines:
         elif isinstance(event, Noted):
             self._write_note(event.message)
         elif isinstance(event, PhaseProgress | TrainingProgress) and time.monotonic() >= self._next_at:
-            self._next_at = time.monotonic() + self._interval_seconds
-            self._write(self._event_line(event))
+            line = self._event_line(event)
+            if line == self._last:  # a long step tells that it goes on, which is no news
+                return
+            self._next_at, self._last = time.monotonic() + self._interval_seconds, line
+            self._write(line)
 
     def _event_line(self, event: PhaseProgress | TrainingProgress) -> str:
         if isinstance(event, PhaseProgress):
