@@ -162,6 +162,7 @@ def count_code(module: str, function: str) -> int:
     )
 
 
+@cache
 def _relative_folder(module: str) -> Path:
     versions = f"{sys.implementation.cache_tag}-numba{version('numba')}-llvmlite{version('llvmlite')}"
     return Path(versions) / f"{module.rpartition('.')[2]}-{source_digest(module)}"
