@@ -50,6 +50,8 @@ class Fleet:
     data: Path
     roots: dict[str, Path]
     address: str = ""
+    worker_prefix: tuple[str, ...] = ()
+    """Command that begins each worker, such as ``nice``."""
     _database: EmbeddedPostgres = field(init=False)
     _conninfo: str = ""
     _token: str = field(default_factory=new_secret)
@@ -112,7 +114,8 @@ class Fleet:
     def start_worker(self, name: str) -> None:
         """Start a worker."""
         root = self.roots[name]
-        command = [sys.executable, "-m", *program(root), "worker", "--queues", "cpu", "--name", name]
+        words = ("worker", "--queues", "cpu", "--name", name)
+        command = [*self.worker_prefix, sys.executable, "-m", *program(root), *words]
         environment = self._environment(root, {"WORK": str(self.data / f"work-{name}")})
         with self._log(name) as log:
             self._processes[name] = subprocess.Popen(

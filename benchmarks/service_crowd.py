@@ -207,7 +207,9 @@ def main() -> None:
         Path(name).chmod(0o711)  # the database runs as a user of its own
         data = Path(name) / "data"
         data.mkdir()
-        fleet = Fleet(data, {"front": ROOT} | {f"w{k:02d}": ROOT for k in range(options.workers)})
+        roots = {"front": ROOT} | {f"w{k:02d}": ROOT for k in range(options.workers)}
+        # Elsewhere they would take no core from the front end and the database.
+        fleet = Fleet(data, roots, worker_prefix=("nice", "-n", "19"))
         fleet.begin()
         try:
             tokens = [
