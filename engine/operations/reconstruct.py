@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, ValidationError
 
@@ -24,7 +24,7 @@ from octasplat.engine.settings.nested_options import merge_options
 from octasplat.engine.settings.refusals import InvalidSettingsError, refusals_from
 
 if TYPE_CHECKING:
-    from octasplat.engine.pipeline import OnStep
+    from octasplat.engine.pipeline import BlockRequest, OnStep
     from octasplat.engine.runs.config import ReconstructionConfig
 
 _CONFIG, _METRICS, _REPORT, _SCENE = "config.json", "metrics.json", "report.html", "scene.ply"
@@ -165,6 +165,11 @@ class ReconstructRequest(ReconstructOptions, Request):
         description="Go on with the run in the output folder, if there is one; without other options its own "
         "settings are taken.",
     )
+    blocks: Annotated[int, Field(ge=1, le=10_000)] | Literal["auto"] | None = Field(
+        None,
+        description="Train the scene in so many blocks, one after the other; auto takes the fewest that the "
+        "number of photographs and the memory ask for, which is 1 for most scenes.",
+    )
 
 
 class ReconstructResult(Result):
@@ -222,7 +227,9 @@ def run_config(request: ReconstructRequest) -> "ReconstructionConfig":
     from octasplat.engine.runs.config import read_config
 
     # with options the request's configuration counts, and is checked against the run's
-    given = request.model_fields_set - {"source", "output", "resume", "exports", "frames_per_second"}
+    given = request.model_fields_set - {
+        *("source", "output", "resume", "exports", "frames_per_second", "blocks")
+    }  # fmt: skip
     # empty ones say nothing, whoever filled them in
     given -= {name for name in ("train", "assignments") if not getattr(request, name)}
     if not request.resume or given or not (request.output / _CONFIG).exists():
@@ -239,6 +246,15 @@ def scene_folder(request: ReconstructRequest) -> Path:
 
     source = request.source
     return request.output.with_name(f"{request.output.name}-frames") if is_video(source) else source
+
+
+def _block_request(request: ReconstructRequest) -> "BlockRequest | None":
+    """Return how the request wants the scene to be trained in blocks; None where it does not say."""
+    from octasplat.engine.pipeline import BlockRequest
+
+    if request.blocks is None:
+        return None
+    return BlockRequest(count=None if request.blocks == "auto" else request.blocks)
 
 
 def _take_frames(request: ReconstructRequest, folder: Path, progress: EventListener) -> None:
@@ -296,6 +312,7 @@ def run(
         progress=stop_when_asked(progress, should_stop),
         should_stop=should_stop,
         on_step=on_step,
+        blocks=_block_request(request),
     )
     return ReconstructResult(
         files=tuple(output / name for name in (_SCENE, *config.exports, _METRICS, _REPORT)),

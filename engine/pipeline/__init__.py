@@ -6,7 +6,8 @@ or killed goes on where it was.
     (find poses ->) open the dataset (-> mend poses and lenses) -> train -> evaluate -> export
 """
 
+from octasplat.engine.pipeline.block_request import BlockRequest
 from octasplat.engine.pipeline.reconstruction import reconstruct
 from octasplat.engine.pipeline.run import OnStep
 
-__all__ = ["OnStep", "reconstruct"]
+__all__ = ["BlockRequest", "OnStep", "reconstruct"]

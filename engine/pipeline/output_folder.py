@@ -12,7 +12,7 @@ from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset.model_sources import has_model
 from octasplat.engine.poses.find_poses import read_pose_record
 from octasplat.engine.runs.config import ReconstructionConfig, read_config
-from octasplat.engine.runs.run_folder import CACHE, CONFIG, EVENTS, POSES
+from octasplat.engine.runs.run_folder import BLOCKS, CACHE, CONFIG, EVENTS, POSES
 
 
 def claim_output(scene: Path, output: Path, config: ReconstructionConfig, resume: bool) -> bool:
@@ -67,6 +67,7 @@ def release_on_refusal(output: Path, *, is_new: bool, is_made: bool) -> Iterator
         if is_new:
             (output / CONFIG).unlink()
             (output / EVENTS).unlink()
+            shutil.rmtree(output / BLOCKS, ignore_errors=True)
             if not _is_from_pose_search(output / POSES):
                 shutil.rmtree(output / POSES, ignore_errors=True)
             if is_made:

@@ -9,6 +9,7 @@ from octasplat.engine.core.events import EventListener, JsonLinesWriter, RunFini
 from octasplat.engine.core.threads import use_threads
 from octasplat.engine.dataset.views_file import ViewsRecord, read_views
 from octasplat.engine.files import check_writable
+from octasplat.engine.pipeline.block_request import BlockRequest, keep_request
 from octasplat.engine.pipeline.dataset_steps import FindPoses, OpenDataset
 from octasplat.engine.pipeline.output_folder import claim_output, release_on_refusal
 from octasplat.engine.pipeline.result_steps import EvaluateStep, ExportStep
@@ -33,6 +34,7 @@ def reconstruct(
     progress: EventListener = lambda _event: None,
     should_stop: Callable[[], bool] = lambda: False,
     on_step: OnStep | None = None,
+    blocks: BlockRequest | None = None,
 ) -> Path:
     """Reconstruct ``scene`` into the folder ``output`` and return it.
 
@@ -49,7 +51,9 @@ def reconstruct(
         threads: for everything; 0 means all cores.
         progress: receives the events that also go to ``events.jsonl``.
         should_stop: asked now and then; True stops the run after a checkpoint.
-        on_step: shown the training after each iteration; it must change nothing.
+        on_step: shown the training after each iteration of a scene that is trained as a whole; it must
+            change nothing.
+        blocks: how to train in blocks; None trains the scene as a whole or, with ``resume``, as it was begun.
 
     Raises:
         DatasetError: the photographs or the model cannot be used, or no poses be found.
@@ -68,6 +72,7 @@ def reconstruct(
     # before the claim, which makes the folder
     is_made, is_new = not output.exists(), claim_output(scene, output, config, resume)
     with lock_run_folder(output):
+        blocks = keep_request(output, blocks, is_new=is_new)
         _run_all_steps(
             ReconstructionRun(
                 scene=scene,
@@ -77,6 +82,7 @@ def reconstruct(
                 progress=progress,
                 should_stop=should_stop,
                 on_step=on_step,
+                blocks=blocks,
             ),
             is_new=is_new,
             is_made=is_made,

@@ -11,6 +11,7 @@ from octasplat.engine.core.events import EventListener
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.dataset.views_file import ViewsRecord
 from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.pipeline.block_request import BlockRequest
 from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.protocol import Tracer
@@ -32,6 +33,7 @@ class ReconstructionRun:
         should_stop: asked now and then; True stops the run after a checkpoint.
         on_step: called with the training after each iteration.
         recorded: the photographs of a run that goes on; None for a new one.
+        blocks: how to train in blocks; None trains the scene as a whole.
         check_views: called with the photographs that were found, before decoding; raises to reject them.
     """
 
@@ -43,6 +45,7 @@ class ReconstructionRun:
     should_stop: Callable[[], bool]
     on_step: OnStep | None = None
     recorded: ViewsRecord | None = None
+    blocks: BlockRequest | None = None
     check_views: Callable[[ViewsRecord], None] | None = None
     _dataset: Dataset | None = None
 

@@ -1,12 +1,15 @@
 """The training step: its result is the scene, and what the training learnt beside it."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
 
-from octasplat.engine.core.events import EventListener, Noted, Warned
+from octasplat.engine.blocks.block_scene import COARSE, train_in_blocks
+from octasplat.engine.blocks.piece_training import BlockWork
+from octasplat.engine.core.events import EventListener, Noted, Warned, ignore_events
 from octasplat.engine.core.progress import PhaseClock, phase
 from octasplat.engine.core.threads import use_threads
 from octasplat.engine.core.writing import write_json
@@ -23,12 +26,16 @@ from octasplat.engine.render.shots import training_pixel_angle
 from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.runs.run_folder import (
     BACKGROUND,
+    BLOCKS,
+    CACHE,
     CHECKPOINTS,
     ENVIRONMENT_EXR,
     ENVIRONMENT_HDR,
     PLAN,
     SCENE,
     TRAINING,
+    found_model_folder,
+    open_run_dataset,
 )
 from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.shading.protocol import ShadingModel
@@ -79,6 +86,8 @@ class TrainStep:
 
 
 def _train(run: ReconstructionRun, clock: PhaseClock) -> FlatGaussians:
+    if run.blocks is not None and (count := run.blocks.resolve(run.config, run.dataset)) > 1:
+        return _train_in_blocks(run, count, run.blocks.most_gaussians)
     if not any((run.output / CHECKPOINTS).glob("*.npz")):
         _warn_of_useless_materials(run)  # before the plan, which shares out what is left of the time
     config = _plan_settings(
@@ -97,6 +106,42 @@ def _train(run: ReconstructionRun, clock: PhaseClock) -> FlatGaussians:
         trainer, run.dataset, nearest_world, clock, run.output, keeps_near_free=config.camera_clearance > 0
     )
     return gaussians
+
+
+def _train_in_blocks(run: ReconstructionRun, count: int, most_gaussians: int | None) -> FlatGaussians:
+    """Return the scene trained in so many blocks; writes the facts on it."""
+    dataset, config = run.dataset, run.config.train
+    exposure, exposure_changes = resolve_exposure(config.exposure, dataset, has_materials=False)
+    if exposure_changes is not None:
+        run.progress(Warned(f"{exposure_changes} That is learnt; exposure=false leaves it out."))
+    work = BlockWork(
+        dataset,
+        config.model_copy(update={"exposure": exposure}),
+        run.output / BLOCKS,
+        run.threads,
+        run.progress,
+        run.should_stop,
+    )
+    coarse_cache = run.output / BLOCKS / COARSE / CACHE
+
+    def open_coarse(side_px: int) -> Dataset:
+        smaller = run.config.model_copy(update={"max_side": side_px})
+        return open_run_dataset(
+            run.scene, run.output, smaller, run.threads, ignore_events,
+            model_folder=found_model_folder(run.output), cache=coarse_cache,
+        )  # fmt: skip
+
+    scene = train_in_blocks(work, count, open_coarse, most_gaussians=most_gaussians)
+    shutil.rmtree(coarse_cache, ignore_errors=True)
+    _write_learnt_light(scene.shading, scene.gaussians, run.output, run.progress)
+    record: dict[str, object] = {
+        "seconds": sum(piece.get("seconds", 0.0) for piece in scene.record.values()),
+        "iterations": sum(int(piece.get("iterations", 0)) for piece in scene.record.values()),
+        "pieces": scene.record,
+    }
+    nearest_world = camera_clearances(dataset.viewpoints, dataset.points)
+    _write_record(record, dataset, scene.shading, nearest_world, run.output)
+    return scene.gaussians
 
 
 def _make_trainer(
@@ -133,7 +178,7 @@ def _make_trainer(
         progress=progress,
         threads=run.threads,
         should_stop=run.should_stop,
-        min_scale=_min_scale(dataset, config.min_scale_px),
+        min_scale=MinScale.of_views(dataset.viewpoints, dataset.train_indices, config.min_scale_px),
         camera_clearance=zones if config.camera_clearance > 0 else None,
         view_frusta=frusta if _prunes_unseen(config.materials) else None,
         on_step=None
@@ -210,21 +255,24 @@ def _write_training_record(
         record["training_views"] = trainer.views.as_dict()
     if trainer.poses is not None:
         record["poses"] = trainer.poses.as_dict()
-    if (exposures := find_exposures(trainer.shading)) is not None:
-        record["exposures"] = exposures.as_dict([view.name for view in dataset.views])
     if keeps_near_free:
         record["taken_near"] = trainer.state.pruned_near_cameras
+    _write_record(record, dataset, trainer.shading, nearest_world, output)
+
+
+def _write_record(
+    record: dict[str, object],
+    dataset: Dataset,
+    shading: ShadingModel,
+    nearest_world: Float64[np.ndarray, " views"],
+    output: Path,
+) -> None:
+    """Write a record of a training with the exposures and the nearest distance of each view."""
+    if (exposures := find_exposures(shading)) is not None:
+        record["exposures"] = exposures.as_dict([view.name for view in dataset.views])
     distances = dict(zip((view.name for view in dataset.views), nearest_world.tolist(), strict=True))
     record["nearest_world"] = {name: distance for name, distance in distances.items() if distance > 0}
     write_json(output / TRAINING, record)
-
-
-def _min_scale(dataset: Dataset, min_scale_px: float) -> MinScale | None:
-    if min_scale_px == 0:
-        return None
-    pixel_rad = training_pixel_angle(dataset.viewpoints)
-    origins = np.stack([dataset.views[i].origin_world for i in dataset.train_indices.tolist()])
-    return MinScale(origins, min_scale_px * pixel_rad)
 
 
 def _plan_settings(

@@ -26,6 +26,7 @@ CONFIG, EVENTS, HELD_OUT, SCENE, TRAINING, VIEWS = (
 METRICS, REPORT = "metrics.json", "report.html"
 CHECKPOINTS, CACHE, POSES = "checkpoints", "cache", "poses"
 PLAN = "plan.json"
+BLOCKS = "blocks"
 ENVIRONMENT_HDR, ENVIRONMENT_EXR = "environment.hdr", "environment.exr"
 """The learnt light, for programs that show it and as it was learnt: an HDR has one exponent for all channels
 of a pixel, so that a dark channel beside a bright one is coarse."""
@@ -214,6 +215,7 @@ def open_run_dataset(
     *,
     model_folder: Path | None = None,
     check_views: Callable[[ViewsRecord], None] | None = None,
+    cache: Path | None = None,
 ) -> Dataset:
     """Open the photographs of a run with its settings, ready for training or evaluation.
 
@@ -226,6 +228,7 @@ def open_run_dataset(
         model_folder: of poses that were found, see :func:`found_model_folder`.
         check_views: called with the record of the views before any photograph is decoded; raises to reject
             the dataset.
+        cache: folder of the decoded photographs; None takes that of the run.
 
     Raises:
         DatasetError: the photographs cannot be used.
@@ -233,7 +236,7 @@ def open_run_dataset(
     """
     dataset = Dataset.open(
         scene,
-        output / CACHE,
+        cache or output / CACHE,
         max_side=config.max_side,
         test_every=config.test_every,
         held_out=config.held_out,

@@ -6,7 +6,9 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.spatial import cKDTree
 
+from octasplat.engine.dataset.model import Viewpoints
 from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.render.shots import training_pixel_angle
 from octasplat.engine.train.optimization.adam import Adam
 from octasplat.engine.train.optimization.weight_averaging import WeightAverage
 
@@ -85,6 +87,17 @@ class MinScale:
 
     origins_world: Float64[np.ndarray, "c 3"]
     angle_rad: float
+
+    @classmethod
+    def of_views(
+        cls, viewpoints: Viewpoints, train_indices: Int64[np.ndarray, " t"], min_scale_px: float
+    ) -> "MinScale | None":
+        """Return the least size of so many pixels of the nearest training view; None where that is 0."""
+        if min_scale_px == 0:
+            return None
+        pixel_rad = training_pixel_angle(viewpoints)
+        origins = np.stack([viewpoints.views[i].origin_world for i in train_indices.tolist()])
+        return cls(origins, min_scale_px * pixel_rad)
 
     def apply(self, gaussians: FlatGaussians) -> None:
         """Raise the scales that are smaller, in place."""

@@ -16,6 +16,7 @@ from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.shading.recipes import material_shading
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import Tracer
+from octasplat.engine.trace.surroundings import SurroundedTracer
 from octasplat.engine.train.config import TrainConfig, iteration_count, max_gaussian_count
 from octasplat.engine.train.densify import make_densifier
 from octasplat.engine.train.densify.normal_propagation import NormalPropagation
@@ -55,6 +56,7 @@ class Trainer:
         min_scale: least size of Gaussians.
         camera_clearance: zones around cameras in which no Gaussian stays, whatever the strategy does.
         view_frusta: frusta of the views; no Gaussian stays outside of all of them.
+        surroundings: Gaussians that are seen, too, and stay as they are; not with a tracer that is given.
         tracer: anything that follows the protocol; None takes the one that the configuration names.
         shading: anything that follows the protocol; None takes the one that the configuration asks for.
         on_step: called after each iteration with the number of those done and the tracer as it is then; it
@@ -85,11 +87,13 @@ class Trainer:
         min_scale: MinScale | None = None,
         camera_clearance: CameraClearance | None = None,
         view_frusta: ViewFrusta | None = None,
+        surroundings: FlatGaussians | None = None,
         tracer: Tracer | None = None,
         shading: ShadingModel | None = None,
         on_step: Callable[[int, Tracer], None] | None = None,
     ) -> None:
         self.state = state
+        self._surroundings = surroundings
         self._on_step = on_step
         self._min_scale = min_scale
         self._allowed_region = AllowedRegion(camera_clearance, view_frusta)
@@ -240,7 +244,8 @@ class Trainer:
         """Return a tracer for the next iteration; its boxes leave room for moves between rebuilds."""
         sort = "packet" if self.schedule.uses_shared_sort(self.state.iteration) else "ray"
         settings = self._config.trace.model_copy(update={"sort": sort})
-        return make_tracer(settings, threads=self._threads, box_padding=self._config.box_padding)
+        tracer = make_tracer(settings, threads=self._threads, box_padding=self._config.box_padding)
+        return tracer if self._surroundings is None else SurroundedTracer(tracer, self._surroundings)
 
     def _rebuild_bvh(self) -> None:
         """Rebuild the BVH over the current Gaussians, replacing the tracer when the sort mode changes."""

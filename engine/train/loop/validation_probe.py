@@ -14,7 +14,7 @@ from octasplat.engine.shading.protocol import ShadingModel, TracedRays
 from octasplat.engine.trace.protocol import Tracer
 from octasplat.engine.train.loop.checkpoint import BestState, load_best, save_best
 from octasplat.engine.train.loop.state import TrainState
-from octasplat.engine.train.sampling.pixel_sampler import PixelSampler, TrainingData, view_sizes_px
+from octasplat.engine.train.sampling.pixel_sampler import TrainingData, pixel_sampler
 from octasplat.engine.train.shading_factory import find_exposures
 from octasplat.engine.train.views.view_grids import estimate_untrained_exposures
 
@@ -53,7 +53,7 @@ def draw_probe(
     rng: np.random.Generator,
 ) -> RayProbe:
     """Draw ``count`` pixels of the views ``indices``."""
-    view, y, x = PixelSampler(indices, view_sizes_px(dataset)).pixels(rng, count)
+    view, y, x = pixel_sampler(dataset, indices).pixels(rng, count)
     rgb, alpha, weight = dataset.pixels(view, y, x)
     # all masked out: nothing to average
     covered = float(np.average(alpha, weights=weight)) if weight.any() else 0.0

@@ -20,10 +20,9 @@ from octasplat.engine.train.config import (
     ray_patch_side_px,
 )
 from octasplat.engine.train.sampling.pixel_sampler import (
-    PixelSampler,
     TrainingData,
+    pixel_sampler,
     valid_pixel_fraction,
-    view_sizes_px,
 )
 from octasplat.engine.train.sampling.visibility_rays import ObservedPoints, VisibilityRays
 
@@ -88,7 +87,7 @@ class BatchOptions:
         Raises:
             DatasetError: masks or alpha leave nothing of the training photographs.
         """
-        sampler = PixelSampler(dataset.train_indices, view_sizes_px(dataset))
+        sampler = pixel_sampler(dataset, dataset.train_indices)
         pixels, valid = sampler.pixel_count, valid_pixel_fraction(dataset)
         pixels_per_gaussian = pixels * valid / max_gaussian_count(config, pixels, valid)
         return cls(
@@ -123,7 +122,7 @@ class BatchSource:
             )
         self._dataset = dataset
         self._options = options
-        self.sampler = PixelSampler(dataset.train_indices, view_sizes_px(dataset))
+        self.sampler = pixel_sampler(dataset, dataset.train_indices)
         self._ssim_patches = self._patch_count()
         self._visibility_rays: VisibilityRays | None = None
         needs_visibility_rays = options.visibility_ray_fraction > 0
@@ -133,7 +132,7 @@ class BatchSource:
     def exclude_views(self, views: Int64[np.ndarray, " m"]) -> None:
         """Draw nothing of these views any more."""
         remaining = np.setdiff1d(self._dataset.train_indices, views)
-        self.sampler = PixelSampler(remaining, view_sizes_px(self._dataset))
+        self.sampler = pixel_sampler(self._dataset, remaining)
         if self._visibility_rays is not None:
             self._visibility_rays = self._visibility_rays.exclude_views(views)
 

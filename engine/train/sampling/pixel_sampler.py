@@ -1,6 +1,7 @@
 """What training needs of a dataset, and pixels drawn from its views: singly, in ray patches, or in blocks."""
 
 import math
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -48,6 +49,48 @@ class TrainingData(PixelSource, Protocol):
     extent: float
 
 
+@dataclass(frozen=True, eq=False)
+class Rectangles:
+    """Rectangles of pixels of some views, none of which overlap; a view may have several.
+
+    Attributes:
+        view: index of the view of each, ascending.
+        corner_px: x and y of the first pixel.
+        size_px: width and height, 1 at least.
+    """
+
+    view: Int64[np.ndarray, " k"]
+    corner_px: Int64[np.ndarray, "k 2"]
+    size_px: Int64[np.ndarray, "k 2"]
+
+    def __len__(self) -> int:
+        return len(self.view)
+
+    @property
+    def pixel_count(self) -> int:
+        """Return the number of pixels in all of them."""
+        return int(self.size_px.prod(axis=1).sum())
+
+    def of_views(self, views: Int64[np.ndarray, " v"]) -> "Rectangles":
+        """Return those of some views."""
+        is_kept = np.isin(self.view, views)
+        return Rectangles(self.view[is_kept], self.corner_px[is_kept], self.size_px[is_kept])
+
+
+@runtime_checkable
+class PartialTrainingData(TrainingData, Protocol):
+    """Photographs of which only some pixels are trained on."""
+
+    trained_pixels: Rectangles
+
+
+def pixel_sampler(dataset: TrainingData, view_indices: Int64[np.ndarray, " v"]) -> "PixelSampler":
+    """Return a sampler of some views: of all their pixels, or of those that are trained on."""
+    if isinstance(dataset, PartialTrainingData):
+        return PixelSampler.of_rectangles(dataset.trained_pixels.of_views(view_indices))
+    return PixelSampler(view_indices, view_sizes_px(dataset))
+
+
 class PixelSampler:
     """Draws pixels uniformly over all pixels of the given views.
 
@@ -59,7 +102,15 @@ class PixelSampler:
     def __init__(self, view_indices: Int64[np.ndarray, " v"], sizes_px: Int64[np.ndarray, "n 2"]) -> None:
         self._views = view_indices
         self._sizes = sizes_px[view_indices]
+        self._corners = np.zeros_like(self._sizes)
         self._ends = np.cumsum(self._sizes[:, 0] * self._sizes[:, 1])
+
+    @classmethod
+    def of_rectangles(cls, rectangles: Rectangles) -> "PixelSampler":
+        """Return a sampler of the pixels in rectangles, each of which is drawn from as a view is."""
+        sampler = cls(np.arange(len(rectangles)), rectangles.size_px)
+        sampler._views, sampler._corners = rectangles.view, rectangles.corner_px
+        return sampler
 
     @property
     def pixel_count(self) -> int:
@@ -85,7 +136,8 @@ class PixelSampler:
         view_rows = np.searchsorted(self._ends, flat, side="right")
         width, height = self._sizes[view_rows].T
         local = flat - (self._ends[view_rows] - width * height)
-        return self._views[view_rows], local // width, local % width
+        left, top = self._corners[view_rows].T
+        return self._views[view_rows], top + local // width, left + local % width
 
     def ray_patches(
         self, rng: np.random.Generator, count: int, *, rays: int, side: int, index: int = 0
@@ -106,10 +158,11 @@ class PixelSampler:
         y = top[:, None] + rows * cell + rng.integers(0, cell, (count, rays))
         x = left[:, None] + columns * cell + rng.integers(0, cell, (count, rays))
         view = np.broadcast_to(self._views[view_rows][:, None], x.shape)
+        corner_x, corner_y = self._corners[view_rows].T
         return (
             view.reshape(-1),
-            _mirror_into(y, height[:, None]).reshape(-1),
-            _mirror_into(x, width[:, None]).reshape(-1),
+            (corner_y[:, None] + _mirror_into(y, height[:, None])).reshape(-1),
+            (corner_x[:, None] + _mirror_into(x, width[:, None])).reshape(-1),
         )
 
     def _stratified_pixels(
@@ -144,6 +197,7 @@ class PixelSampler:
         width, height = self._sizes[view_rows].T
         left = rng.integers(0, width - side + 1)
         top = rng.integers(0, height - side + 1)
+        left, top = left + self._corners[view_rows, 0], top + self._corners[view_rows, 1]
         shape = (count, side, side)
         rows, columns = np.arange(side)[None, :, None], np.arange(side)[None, None, :]
         view = np.broadcast_to(self._views[view_rows][:, None, None], shape)
@@ -171,7 +225,7 @@ def valid_pixel_fraction(dataset: TrainingData) -> float:
     Raises:
         DatasetError: masks or alpha leave nothing of the training photographs.
     """
-    sampler = PixelSampler(dataset.train_indices, view_sizes_px(dataset))
+    sampler = pixel_sampler(dataset, dataset.train_indices)
     view, y, x = sampler.pixels(np.random.Generator(np.random.PCG64(0)), VALID_PIXEL_SAMPLES)
     _, alpha, weight = dataset.pixels(view, y, x)
     valid_count = int(((alpha > 0) & (weight > 0)).sum())

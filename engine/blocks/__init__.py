@@ -1,0 +1,1 @@
+"""Trainings in blocks: a coarse scene, its partition, a training for each block, and their merge."""

@@ -1,0 +1,83 @@
+"""Request to train a scene in blocks: kept with its run, and resolved to their number."""
+
+import math
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from octasplat.engine.blocks.block_plan import MARGIN
+from octasplat.engine.blocks.piece_settings import require_blocks_possible
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.writing import write_text
+from octasplat.engine.dataset import Dataset
+from octasplat.engine.runs.config import ReconstructionConfig
+from octasplat.engine.runs.run_folder import BLOCKS
+from octasplat.engine.train.config import max_gaussian_count
+from octasplat.engine.train.sampling.pixel_sampler import valid_pixel_fraction
+
+AUTO_VIEWS = 500
+"""Training views for each of which so many a scene gets a block more, where their number is automatic."""
+REQUEST = "request.json"
+
+
+class BlockRequest(BaseModel):
+    """How a scene is to be trained in blocks.
+
+    Attributes:
+        count: number of blocks; None lets photographs and memory decide.
+        most_gaussians: of any block with its margin; None for no such limit.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    count: int | None = Field(None, ge=1)
+    most_gaussians: int | None = Field(None, ge=1)
+
+    def resolve(self, config: ReconstructionConfig, dataset: Dataset) -> int:
+        """Return the number of blocks: the fewest, 1 for a scene that one training holds.
+
+        Args:
+            config: of the run.
+            dataset: the photographs.
+
+        Raises:
+            ConfigError: settings with which a scene is not trained in blocks.
+        """
+        count = self.count or self._fewest(config, dataset)
+        if count > 1:
+            require_blocks_possible(config.train, has_time_budget=config.minutes is not None)
+        return count
+
+    def _fewest(self, config: ReconstructionConfig, dataset: Dataset) -> int:
+        by_views = math.ceil(len(dataset.train_indices) / AUTO_VIEWS)
+        if self.most_gaussians is None:
+            return by_views
+        pixels, valid = dataset.train_pixel_count, valid_pixel_fraction(dataset)
+        wanted = max_gaussian_count(config.train, pixels, valid)
+        if wanted <= self.most_gaussians:
+            return by_views
+        # blocks overlap by their margins
+        return max(by_views, math.ceil(wanted * (1 + 2 * MARGIN) / self.most_gaussians))
+
+
+def keep_request(output: Path, request: BlockRequest | None, *, is_new: bool) -> BlockRequest | None:
+    """Return the request of a run: the one given, which a new run keeps, or the one that it has kept.
+
+    Raises:
+        ConfigError: the run was begun with another one.
+    """
+    path = output / BLOCKS / REQUEST
+    if is_new:
+        if request is not None:
+            write_text(path, request.model_dump_json(indent=2) + "\n")
+        return request
+    try:
+        kept = BlockRequest.model_validate_json(path.read_text(encoding="utf-8")) if path.exists() else None
+    except (OSError, ValidationError) as error:
+        raise ConfigError(f"{path} cannot be read ({error}); train again without --resume.") from None
+    if request is not None and request != kept:
+        raise ConfigError(
+            f"The run in {output} was begun with other blocks than this command asks for; repeat its "
+            "--blocks and --memory, leave them out, or name another folder."
+        )
+    return kept
