@@ -11,7 +11,6 @@ from octasplat.engine.blocks.block_dataset import BlockDataset
 from octasplat.engine.blocks.block_plan import Block, plan_blocks
 from octasplat.engine.blocks.piece_progress import PieceProgress
 from octasplat.engine.blocks.piece_settings import (
-    COARSE_ITERATIONS,
     POLISH_FRACTION,
     block_settings,
     coarse_settings,
@@ -113,7 +112,7 @@ def _train_coarse(
     config = coarse_settings(work.config)
     each = iteration_count(work.config, work.dataset.train_pixel_count)
     names = {_block_name(number): each for number in range(1, count + 1)}
-    tell.expect({COARSE: config.iterations or COARSE_ITERATIONS, **names})
+    tell.expect({COARSE: config.iterations, **names})
     side_px = coarse_side_px(int(view_sizes_px(work.dataset).max()))
     data = work.dataset if is_piece_done(work, COARSE) else open_coarse(side_px)
 

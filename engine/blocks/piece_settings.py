@@ -1,10 +1,15 @@
 """Settings of the trainings of a run in blocks, made from those of the run."""
 
+import math
+
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.train.config import TrainConfig
 
 COARSE_ITERATIONS, COARSE_GAUSSIANS = 2_500, 50_000
 """Most of the coarse scene, as of the preset fast."""
+COARSE_ITERATION_FRACTION, COARSE_GAUSSIAN_FRACTION = 1 / 2, 1 / 4
+"""Most of it where the run says how many: of the iterations of a block, and of all Gaussians, as photographs
+of half the size have a quarter of the pixels."""
 MIN_COARSE_SIDE_PX = 200
 POLISH_FRACTION = 0.1
 """Iterations of the polish, of those that an ordinary training of its pixels takes."""
@@ -36,10 +41,12 @@ def coarse_side_px(longest_side_px: int) -> int:
 
 def coarse_settings(config: TrainConfig) -> TrainConfig:
     """Return the settings of the coarse scene."""
+    iterations = math.ceil(COARSE_ITERATION_FRACTION * config.iterations) or COARSE_ITERATIONS
+    most_gaussians = math.ceil(COARSE_GAUSSIAN_FRACTION * config.max_gaussians)  # 0 asks the pixels
     return config.model_copy(
         update={
-            "iterations": min(config.iterations or COARSE_ITERATIONS, COARSE_ITERATIONS),
-            "max_gaussians": min(config.max_gaussians, COARSE_GAUSSIANS),
+            "iterations": min(iterations, COARSE_ITERATIONS),
+            "max_gaussians": min(most_gaussians, COARSE_GAUSSIANS),
             "max_gaussians_auto": min(config.max_gaussians_auto, COARSE_GAUSSIANS),
         }
     )

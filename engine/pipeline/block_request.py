@@ -67,15 +67,16 @@ def keep_request(output: Path, request: BlockRequest | None, *, is_new: bool) ->
         ConfigError: the run was begun with another one.
     """
     path = output / BLOCKS / REQUEST
+    given = None if request is not None and request.count == 1 else request  # one block is an ordinary run
     if is_new:
-        if request is not None:
-            write_text(path, request.model_dump_json(indent=2) + "\n")
-        return request
+        if given is not None:
+            write_text(path, given.model_dump_json(indent=2) + "\n")
+        return given
     try:
         kept = BlockRequest.model_validate_json(path.read_text(encoding="utf-8")) if path.exists() else None
     except (OSError, ValidationError) as error:
         raise ConfigError(f"{path} cannot be read ({error}); train again without --resume.") from None
-    if request is not None and request != kept:
+    if request is not None and given != kept:
         raise ConfigError(
             f"The run in {output} was begun with other blocks than this command asks for; repeat its "
             "--blocks and --memory, leave them out, or name another folder."

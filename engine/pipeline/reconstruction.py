@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from octasplat.engine.blocks.piece_settings import require_blocks_possible
 from octasplat.engine.core.errors import CheckpointError
 from octasplat.engine.core.events import EventListener, JsonLinesWriter, RunFinished, broadcast
 from octasplat.engine.core.threads import use_threads
@@ -68,6 +69,8 @@ def reconstruct(
     """
     if not (output / SCENE).exists():
         check_writable(config.exports)
+    if blocks is not None and (blocks.count or 1) > 1:  # of an automatic number it is known later
+        require_blocks_possible(config.train, has_time_budget=config.minutes is not None)
     use_threads(threads)
     # before the claim, which makes the folder
     is_made, is_new = not output.exists(), claim_output(scene, output, config, resume)

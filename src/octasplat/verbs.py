@@ -100,6 +100,7 @@ def reconstruct(
     assignments: Sequence[str] | None = None,
     frames_per_second: float | None = None,
     resume: bool = False,
+    blocks: int | Literal["auto"] | None = None,
     on_step: OnStep | None = None,
     progress: EventListener | None = None,
     should_stop: Callable[[], bool] = never_stop,
@@ -155,6 +156,8 @@ def reconstruct(
             Default: 2.0.
         resume: Go on with the run in the output folder, if there is one; without other options its own
             settings are taken.
+        blocks: Train the scene in so many blocks, one after the other; auto takes the fewest that the
+            number of photographs and the memory ask for, which is 1 for most scenes.
         on_step: called with the state of the training every few iterations; returning False stops it
             after a checkpoint, and the run that is returned is unfinished. With ``resume=True`` another
             call goes on.
@@ -203,6 +206,7 @@ def reconstruct(
             "output": output,
             "frames_per_second": frames_per_second,
             "resume": resume,
+            "blocks": blocks,
         },
         on_step,
         progress,

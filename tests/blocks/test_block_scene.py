@@ -1,0 +1,215 @@
+"""A scene trained in blocks: as good as the whole, without seams, and the same bytes after any stop."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from octasplat.engine.blocks.block_plan import plan_blocks
+from octasplat.engine.blocks.piece_training import RESULT
+from octasplat.engine.core.errors import CancelledError, ConfigError
+from octasplat.engine.core.events import CheckpointWritten, Event, Noted, TrainingProgress
+from octasplat.engine.dataset import Dataset
+from octasplat.engine.files.gaussian_ply import read_gaussian_ply
+from octasplat.engine.pipeline import BlockRequest, reconstruct
+from octasplat.engine.runs.config import ReconstructionConfig, resolve_config
+from octasplat.engine.trace.factory import make_tracer
+from octasplat.engine.train.loop.checkpoint import load_best
+from tests.support.tiny_dataset import make_tiny_dataset
+
+pytestmark = pytest.mark.heavy
+
+MAX_LOSS_DB = 0.5
+"""Of two blocks against the whole, of as many iterations each."""
+
+
+def make_config(**assignments: object) -> ReconstructionConfig:
+    values: dict[str, object] = {
+        "iterations": 300,
+        "rays_per_batch": 1024,
+        "sh_degree": 1,
+        "max_gaussians": 2000,
+        "initial_points": 800,
+        "densify_from_iter": 20,
+        "densify.start": 20,
+        "densify.interval": 20,
+        "checkpoint_every": 100,
+        "probe_rays": 512,
+        "early_stopping_db": 0,
+        "test_every": 4,
+        "exports": [],
+        "background": "learnt",
+        "exposure": True,
+        **assignments,
+    }
+    return resolve_config("standard", assignments=[f"{k}={json.dumps(v)}" for k, v in values.items()])
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_tiny_dataset(
+        tmp_path_factory, views=40, width_px=96, height_px=72, samples_per_side=2, points=800
+    )
+
+
+@pytest.fixture(scope="module")
+def two_blocks(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Event]]:
+    """A run in two blocks that nothing stopped, on one thread."""
+    events: list[Event] = []
+    output = tmp_path_factory.mktemp("blocks") / "run"
+    blocks = BlockRequest(count=2)
+    reconstruct(scene, output, make_config(), threads=1, blocks=blocks, progress=events.append)
+    return output, events
+
+
+def psnr(run: Path) -> float:
+    return float(json.loads((run / "metrics.json").read_text())["mean"]["psnr"])
+
+
+def test_two_blocks_are_as_good_as_the_whole(scene: Path, two_blocks: tuple, tmp_path: Path) -> None:
+    whole = reconstruct(scene, tmp_path / "whole", make_config(), threads=1)
+    assert psnr(two_blocks[0]) > psnr(whole) - MAX_LOSS_DB
+    assert not (whole / "blocks").exists()
+
+
+def test_merged_scene_numbers_one_core_after_the_other(scene: Path, two_blocks: tuple) -> None:
+    """Each block's kept Gaussians are those in its box, in its order; only those near the cut move on."""
+    run, _ = two_blocks
+    merged, _ = read_gaussian_ply(run / "scene.ply")
+    dataset = Dataset.open(scene, run / "cache", test_every=4)
+    coarse = load_best(run / "blocks" / "coarse").gaussians
+    tracer = make_tracer(make_config().train.trace, threads=1)
+    blocks = plan_blocks(dataset, coarse, 2, tracer, lambda: None)
+    first = 0
+    for number, block in enumerate(blocks, start=1):
+        trained = load_best(run / "blocks" / f"block_{number:03d}").gaussians
+        core = trained.select(block.core.contains(trained.means_world))
+        part = merged.select(slice(first, first + len(core)))
+        first += len(core)
+        is_inner = block.core.grown(-block.margin_world).contains(core.means_world)
+        assert 0 < is_inner.sum() < len(core)
+        np.testing.assert_array_equal(part.means_world[is_inner], core.means_world[is_inner])
+        np.testing.assert_array_equal(part.sh[is_inner], core.sh[is_inner])
+        assert np.abs(part.sh[~is_inner] - core.sh[~is_inner]).max() > 0  # the polish has moved these
+    assert first == len(merged)
+    assert len(merged) < 1.2 * 2000
+
+
+def test_progress_counts_all_trainings(two_blocks: tuple) -> None:
+    run, events = two_blocks
+    told = [event for event in events if isinstance(event, TrainingProgress)]
+    assert [event.iteration for event in told] == sorted(event.iteration for event in told)
+    assert told[-1].iteration == told[-1].total_iterations == 150 + 300 * 2 + 30
+    assert told[-1].seconds_left == 0
+    record = json.loads((run / "training.json").read_text())
+    assert record["iterations"] == 780
+    assert list(record["pieces"]) == ["coarse", "block_001", "block_002", "polish"]
+    assert len(record["exposures"]) == 40
+    assert sum("Block" in event.message for event in events if isinstance(event, Noted)) == 2
+    assert not any((run / "blocks").rglob("checkpoints"))
+
+
+def stop_at(condition: Callable[[Event], bool]) -> tuple[Callable[[Event], None], Callable[[], bool]]:
+    """A listener, and a question whether to stop that is answered by yes once an event meets a condition."""
+    met: list[Event] = []
+
+    def listen(event: Event) -> None:
+        if condition(event):
+            met.append(event)
+
+    return listen, lambda: bool(met)
+
+
+@pytest.mark.parametrize("place", ["coarse", "block_001", "block_002", "polish"])
+def test_stopped_run_ends_with_the_same_bytes(
+    scene: Path, two_blocks: tuple, tmp_path: Path, place: str
+) -> None:
+    run = tmp_path / "run"
+
+    def is_there(event: Event) -> bool:
+        if place == "polish":  # which ends before its first checkpoint
+            return isinstance(event, Noted) and "near to cuts" in event.message
+        return isinstance(event, CheckpointWritten) and place in event.path
+
+    listen, should_stop = stop_at(is_there)
+    with pytest.raises(CancelledError):
+        reconstruct(
+            scene, run, make_config(), threads=2, blocks=BlockRequest(count=2), progress=listen,
+            should_stop=should_stop,
+        )  # fmt: skip
+    assert not (run / "scene.ply").exists()
+    assert not (run / "blocks" / place / RESULT).exists()
+    reconstruct(scene, run, make_config(), threads=2, resume=True)  # the blocks are remembered
+    assert (run / "scene.ply").read_bytes() == (two_blocks[0] / "scene.ply").read_bytes()
+    assert (run / "background.exr").read_bytes() == (two_blocks[0] / "background.exr").read_bytes()
+
+
+def test_automatic_blocks_of_a_small_scene_are_an_ordinary_run(scene: Path, tmp_path: Path) -> None:
+    config = make_config(iterations=30, background="black", exposure=False)
+    runs = [
+        reconstruct(scene, tmp_path / name, config, threads=1, blocks=blocks)
+        for name, blocks in (("none", None), ("one", BlockRequest(count=1)), ("auto", BlockRequest()))
+    ]
+    contents = [(run / "scene.ply").read_bytes() for run in runs]
+    assert contents[0] == contents[1] == contents[2]
+
+
+def test_memory_decides_the_number_of_blocks(scene: Path, tmp_path: Path) -> None:
+    dataset, config = Dataset.open(scene, tmp_path / "cache"), make_config(background="black", exposure=False)
+    assert BlockRequest(most_gaussians=2000).resolve(config, dataset) == 1
+    assert BlockRequest(most_gaussians=900).resolve(config, dataset) == 3
+    assert BlockRequest(count=5, most_gaussians=900).resolve(config, dataset) == 5
+
+
+@pytest.mark.parametrize(
+    ("setting", "name"), [({"refine_poses": True}, "refine_poses"), ({"loss.free_space": 0.1}, "free_space")]
+)
+def test_unsupported_settings_are_refused_before_anything_is_made(
+    scene: Path, tmp_path: Path, setting: dict, name: str
+) -> None:
+    with pytest.raises(ConfigError, match=name):
+        reconstruct(scene, tmp_path / "run", make_config(**setting), blocks=BlockRequest(count=2))
+    assert not (tmp_path / "run").exists()
+
+
+def test_other_blocks_than_the_run_s_own_are_refused(scene: Path, two_blocks: tuple) -> None:
+    for blocks in (BlockRequest(count=3), BlockRequest(count=1), BlockRequest()):
+        with pytest.raises(ConfigError, match="other blocks"):
+            reconstruct(scene, two_blocks[0], make_config(), resume=True, blocks=blocks)
+
+
+def test_no_seam_is_seen_around_the_cut(scene: Path, two_blocks: tuple, tmp_path: Path) -> None:
+    """What blocks lose against the whole is not more where the Gaussians beside the cut are seen."""
+    run, config = two_blocks[0], make_config()
+    whole = reconstruct(scene, tmp_path / "whole", config, threads=1)
+    dataset = Dataset.open(scene, run / "cache", test_every=4)
+    tracer = make_tracer(config.train.trace, threads=1)
+    coarse = load_best(run / "blocks" / "coarse").gaussians
+    blocks = plan_blocks(dataset, coarse, 2, tracer, lambda: None)
+    merged, _ = read_gaussian_ply(run / "scene.ply")
+    means = merged.means_world
+    is_near = np.all([~block.core.grown(-block.margin_world).contains(means) for block in blocks], axis=0)
+    tracer.build(merged, is_near.astype(np.float32)[:, None])
+    errors: dict[str, list[np.ndarray]] = {"blocks": [], "whole": [], "near": []}
+    for view in dataset.test_indices.tolist():
+        rays = dataset.view_rays(view)
+        errors["near"].append(tracer.trace(rays.rays).features[:, 0] > 0.5)
+        photograph, _, _ = dataset.view_image(view)
+        for name, folder in (("blocks", run), ("whole", whole)):
+            (path,) = (folder / "renders").rglob(f"{Path(dataset.views[view].name).stem}*.png")
+            rendered = np.asarray(Image.open(path).convert("RGB"), np.float64) / 255
+            errors[name].append(((rendered - photograph) ** 2).mean(axis=2).ravel())
+    near = np.concatenate(errors["near"])
+    assert 0.02 < near.mean() < 0.9
+    blocks_error, whole_error = (np.concatenate(errors[name]) for name in ("blocks", "whole"))
+    loss_db = [
+        10
+        * np.log10(
+            np.concatenate(errors["blocks"])[part].mean() / np.concatenate(errors["whole"])[part].mean()
+        )
+        for part in (near, ~near)
+    ]
+    assert loss_db[0] < loss_db[1] + MAX_LOSS_DB
