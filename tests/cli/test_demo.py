@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from octasplat.engine.runs import small_surface
 from octasplat.workers.cli import demo_run
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -25,6 +26,10 @@ def tiny_demo(monkeypatch):
         "ssim_patch_side=16",
     )
     monkeypatch.setattr(demo_run, "DEMO_ASSIGNMENTS", {"fast": settings})
+    coarse = small_surface.OPTIONS.model_copy(
+        update={"resolution": 48, "depth_side": 64, "texture_size": 128}
+    )
+    monkeypatch.setattr(small_surface, "OPTIONS", coarse)
 
 
 def test_demo_scene_only_writes_dataset_only(octasplat, tmp_path):
