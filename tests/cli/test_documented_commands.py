@@ -25,7 +25,8 @@ VERBS = {
 PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md")), DOCS / "opening" / "blender.md"]
 WITH_MATERIALS = {"docs/materials.md"}
 PHOTOGRAPHS = (
-    "SCENE", "SCENE/test", "PHOTOS", "PHOTOGRAPHS", "fox", "shiny_knot", "shiny_knot/test", "still_life",
+    "SCENE", "SCENE/test", "PHOTOS", "PHOTOGRAPHS", "SITE", "fox", "shiny_knot", "shiny_knot/test",
+    "still_life",
 )  # fmt: skip
 RUNS = ("OUT", "out")
 SMALLER = {
