@@ -16,6 +16,7 @@ from octasplat.engine.render.framing import fitting_distance, visible_bounds
 from octasplat.engine.render.image_files import exr_layers, write_exr, write_png
 from octasplat.engine.render.pinhole_camera import PinholeCamera, focal_from_fov
 from octasplat.engine.render.pose_paths import Turntable, fit_turntable
+from octasplat.engine.render.renderer import RenderedImage
 from octasplat.engine.render.supersampling import (
     RADIANCE_RAYS_PER_SIDE,
     rays_per_pixel_side,
@@ -148,7 +149,7 @@ def scene_render_fn(
     """Return the function that renders a shot of a scene to a file.
 
     ``.exr`` gets linear R, G, B, alpha A, the expected distance Z (0 where nothing is) and the world normal
-    N.x, N.y, N.z; anything else gets 8-bit display colors.
+    N.x, N.y, N.z; anything else gets 8-bit display colors. Radiance above white is kept by EXR.
 
     Args:
         tracer: with the scene built.
@@ -162,13 +163,17 @@ def scene_render_fn(
     """
 
     def paint(shot: Shot, path: Path, _part: Callable[[float], None]) -> None:
-        rays = shot.rays()
-        side = rays_per_pixel_side(rays, trained_rad)
-        if gives_radiance:
-            image = render_filtered(tracer, rays, background, shading, max(side, RADIANCE_RAYS_PER_SIDE))
-        else:
-            image = render_averaged(tracer, rays, background, shading, side)
-        if path.suffix.lower() == ".exr":
+        is_exr = path.suffix.lower() == ".exr"
+        image = scene_image(
+            tracer,
+            shot.rays(),
+            background,
+            trained_rad=trained_rad,
+            shading=shading,
+            gives_radiance=gives_radiance,
+            max_radiance=np.inf if is_exr else 1.0,
+        )
+        if is_exr:
             layers = exr_layers(
                 image.rgb_srgb,
                 alpha=image.alpha,
@@ -184,6 +189,34 @@ def scene_render_fn(
             write_png(path, image.rgb_srgb)
 
     return paint
+
+
+def scene_image(
+    tracer: Tracer,
+    rays: ImageRays,
+    background: Float32[np.ndarray, "3"],
+    *,
+    trained_rad: float,
+    shading: ShadingModel,
+    gives_radiance: bool,
+    max_radiance: float = 1.0,
+) -> RenderedImage:
+    """Return a picture of a scene; all but ``max_radiance`` is as for :func:`scene_render_fn`.
+
+    Args:
+        tracer: with the scene built.
+        rays: through the centres of the pixels.
+        background: display color behind the scene.
+        trained_rad: angle of a pixel of the training views, or 0.
+        shading: what develops the rays.
+        gives_radiance: whether ``shading`` has the layer ``linear``.
+        max_radiance: where the radiance that a pixel collects is cut off.
+    """
+    side = rays_per_pixel_side(rays, trained_rad)
+    if not gives_radiance:
+        return render_averaged(tracer, rays, background, shading, side)
+    side = max(side, RADIANCE_RAYS_PER_SIDE)
+    return render_filtered(tracer, rays, background, shading, side, max_radiance=max_radiance)
 
 
 def training_pixel_angle(viewpoints: Viewpoints) -> float:

@@ -144,10 +144,20 @@ def render_filtered(
     background: Float32[np.ndarray, "3"],
     shading: ShadingModel,
     side: int,
+    *,
+    max_radiance: float = 1.0,
 ) -> RenderedImage:
     """Return an image whose colors and alpha are filtered as a photograph's pixels collect them.
 
     Everything else is that of the centres of the pixels.
+
+    Args:
+        tracer: built around the Gaussians, with what ``shading`` blends of them.
+        image: rays through the centres of the pixels.
+        background: display color behind the scene.
+        shading: what develops the rays; one that gives no radiance is shown by the centres alone.
+        side: so many rays across a pixel, and as many down.
+        max_radiance: where a pixel's radiance is cut off: at white, as in a photograph, or infinity.
     """
     centre = render_rays(tracer, image, background, shading)
     if LINEAR not in centre.layers:
@@ -155,7 +165,8 @@ def render_filtered(
     means = pixel_means(tracer, image, shading, side)
     alpha = means.alpha[..., None]
     # clipped before the blend, as a photograph's pixel is
-    rgb = linear_to_srgb(np.minimum(means.linear, 1.0)) * alpha + (1 - alpha) * background
+    display = linear_to_srgb(np.minimum(means.linear, np.float32(max_radiance)))
+    rgb = display * alpha + (1 - alpha) * background
     return replace(centre, rgb_srgb=rgb.astype(np.float32), alpha=means.alpha)
 
 

@@ -4,10 +4,20 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from octasplat.engine.gaussians.materials import is_material_known
+from octasplat.engine.gaussians.materials import has_materials, is_material_known
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.render.environment_files import read_background_map, read_environment
-from octasplat.engine.runs.run_folder import BACKGROUND, run_environment, run_exposures
+from octasplat.engine.runs.config import read_config
+from octasplat.engine.runs.run_folder import (
+    BACKGROUND,
+    CONFIG,
+    is_run,
+    run_environment,
+    run_exposures,
+    run_extent,
+    run_viewpoints,
+)
+from octasplat.engine.shading.deferred import DeferredShading
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.train.config import TrainConfig
 from octasplat.engine.train.shading_factory import (
@@ -26,6 +36,28 @@ def shown_options(config: TrainConfig, gaussians: FlatGaussians) -> ShadingOptio
     """
     options = ShadingOptions.from_config(config)
     return options if is_material_known(gaussians).all() else replace(options, materials=None)
+
+
+def learned_materials(output: Path, gaussians: FlatGaussians) -> DeferredShading | None:
+    """Return the shading of a finished run's materials in the light that it has learnt.
+
+    Args:
+        output: folder of the run, or a file, which holds no light.
+        gaussians: its scene.
+
+    Returns:
+        None where nothing was learnt, or some Gaussians have no materials.
+
+    Raises:
+        ConfigError: the run learnt light and its file is missing or damaged.
+    """
+    if not (is_run(output) and has_materials(gaussians)):
+        return None
+    options = shown_options(read_config(output / CONFIG).train, gaussians)
+    if options.materials is None:
+        return None
+    extent = run_extent(output, run_viewpoints(output).extent)
+    return find_deferred(finished_shading(output, options, extent))
 
 
 def finished_shading(

@@ -3,7 +3,7 @@
 A truncated file still has its header, and readers show the missing part in grey or not at all. Where a format
 declares its length or ends with a marker, that is checked; it takes a few reads, whatever the size. Not
 detected: data that are damaged in the middle, a JPEG that was truncated and then closed with an end marker,
-and truncated HDR files, whose rows have any length.
+and HDR files, whose rows have any length, of which the shortest rows would fit into what is left.
 """
 
 import io
@@ -14,7 +14,7 @@ from typing import BinaryIO
 
 from octasplat.engine.core.portable_names import quoted_name
 from octasplat.service.intake.faults import IntakeError, IntakeFault
-from octasplat.service.intake.images import read_null_terminated, unpack_struct
+from octasplat.service.intake.images import read_hdr_size, read_null_terminated, unpack_struct
 
 _TAIL_BYTES = 64 << 10
 _PIECE_BYTES = 1 << 20
@@ -188,6 +188,17 @@ def _is_exr_complete(file: BinaryIO, size_bytes: int) -> bool:
     return bool(last + 8 + length <= size_bytes)
 
 
+def _is_hdr_complete(file: BinaryIO, size_bytes: int) -> bool:
+    """Return whether what follows the header can hold all rows, which are shortest where each is even."""
+    width, height, _ = read_hdr_size(file)
+    start = file.tell()
+    marker, length = unpack_struct(file, ">2H")
+    if marker == 0x0202 and length in (width, height):  # runs by channel, of at most 127 values each
+        row_bytes = 4 + 4 * 2 * -(-length // 127)
+        return bool(size_bytes >= start + width * height // length * row_bytes)
+    return bool(size_bytes >= start + 4 * min(width, height))  # a row has one pixel or more of 4 bytes
+
+
 def _assume_complete(_file: BinaryIO, _size_bytes: int) -> bool:
     return True
 
@@ -199,4 +210,5 @@ _CHECKS: dict[str, Callable[[BinaryIO, int], bool]] = {
     "BMP": _is_bmp_complete,
     "TIFF": _is_tiff_complete,
     "EXR": _is_exr_complete,
+    "HDR": _is_hdr_complete,
 }

@@ -266,7 +266,8 @@ def read_null_terminated(file: Any) -> bytes:
     return bytes(text)
 
 
-def _read_hdr_size(file: Any) -> tuple[int, int, int]:
+def read_hdr_size(file: Any) -> tuple[int, int, int]:
+    """Return width, height and 1 of a Radiance picture, and leave the file where its pixels begin."""
     while line := file.readline().strip():
         if len(line) > 4000:
             raise ValueError("long line")
@@ -285,5 +286,5 @@ _READERS: dict[str, Callable[[Any], tuple[int, int, int]]] = {
     "WebP": _read_webp_size,
     "TIFF": _read_tiff_size,
     "EXR": _read_exr_size,
-    "HDR": _read_hdr_size,
+    "HDR": read_hdr_size,
 }

@@ -1,5 +1,7 @@
 """Validation of uploaded files that options name, such as the meshes and textures of a stage."""
 
+import io
+import struct
 import zipfile
 from collections.abc import Sequence
 from pathlib import PurePosixPath
@@ -19,6 +21,11 @@ MAX_TEXT_LINE_BYTES = 1 << 16
 """Longest line of a text file; programs read such files line by line into memory."""
 _CHUNK_BYTES = 1 << 20
 _MAGIC_NUMBERS = {".glb": b"glTF", ".ply": b"ply"}
+_GLB_HEADER_BYTES = 12
+_GLB_CHUNK = struct.Struct("<I4s")
+"""Length and kind, which begin a chunk."""
+_MAX_GLB_CHUNKS = 64
+"""What follows is left to the reader of the file."""
 _UNCHECKED_SUFFIXES = frozenset({".splat", ".spz"})
 """Nothing in their first bytes says what they are; whoever reads them says so."""
 _TEXT_SUFFIXES = frozenset({".obj", ".mtl", ".txt"})
@@ -59,6 +66,11 @@ def check_input_content(storage: Storage, name: str, sha256: str, limits: ImageL
             what = "text" if suffix in _TEXT_SUFFIXES else f"{suffix[1:].upper()} file"
             detail = f"{quoted_name(name)} is no {what} by its content; send the file anew."
             raise IntakeError(IntakeFault("file-kind", detail, name))
+        if suffix == ".glb" and not _is_glb_complete(file):
+            detail = (
+                f"{quoted_name(name)} is cut off: the end of its GLB data is missing; send the whole file."
+            )
+            raise IntakeError(IntakeFault("file-kind", detail, name))
         if suffix in _TEXT_SUFFIXES and _has_long_line(file):
             detail = f"{quoted_name(name)} has a line of more than {MAX_TEXT_LINE_BYTES:,} bytes; split it."
             raise IntakeError(IntakeFault("file-kind", detail, name))
@@ -72,6 +84,24 @@ def _matches_suffix(file: BinaryIO, suffix: str) -> bool:
     if suffix in _TEXT_SUFFIXES:
         return b"\0" not in head
     return head.startswith(_MAGIC_NUMBERS.get(suffix, b""))
+
+
+def _is_glb_complete(file: BinaryIO) -> bool:
+    """Return whether all chunks lie within the file, and the first one has content, as that of JSON does."""
+    size_bytes = file.seek(0, io.SEEK_END)
+    offset = _GLB_HEADER_BYTES
+    for chunk in range(_MAX_GLB_CHUNKS):
+        file.seek(offset)
+        head = file.read(_GLB_CHUNK.size)
+        if len(head) < _GLB_CHUNK.size:
+            return chunk > 0
+        length, kind = _GLB_CHUNK.unpack(head)
+        if chunk == 0 and (kind != b"JSON" or length == 0):
+            return False
+        offset += _GLB_CHUNK.size + length
+        if offset > size_bytes:
+            return False
+    return True
 
 
 def _has_long_line(file: BinaryIO) -> bool:

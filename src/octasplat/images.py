@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from jaxtyping import Float32, Int32
 
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.rays import ImageRays
 from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.operation_calls import names_checked
@@ -17,9 +18,11 @@ from octasplat.paths import PathLike
 from octasplat.scenes import Scene
 
 if TYPE_CHECKING:
+    from octasplat.engine.shading.deferred import DeferredShading
     from octasplat.engine.trace.protocol import Tracer
 
 Background = Literal["black", "white"] | tuple[float, float, float]
+Shading = Literal["materials", "harmonics"]
 
 
 @dataclass(frozen=True)
@@ -104,7 +107,12 @@ class Image:
 
 @names_checked
 def render_view(
-    scene: Scene, camera: PinholeCamera, *, background: Background = "black", threads: int = 0
+    scene: Scene,
+    camera: PinholeCamera,
+    *,
+    background: Background = "black",
+    shading: Shading | None = None,
+    threads: int = 0,
 ) -> Image:
     """Return what a camera sees of a scene in memory, see :func:`octasplat.rendering.render`.
 
@@ -112,27 +120,45 @@ def render_view(
         scene: the scene.
         camera: where from; :meth:`Scene.camera` and :meth:`Camera.looking_at` make some.
         background: what lies behind, by name or as display values in [0, 1].
+        shading: show materials in the light that the run has learnt, or harmonics; None shows materials if
+            the scene has them, and came with that light.
         threads: 0 takes all cores; the result does not depend on it.
+
+    Raises:
+        ConfigError: materials are asked for, and the scene has none, or no light.
     """
+    from octasplat.engine.gaussians.materials import is_material_known
     from octasplat.engine.render.renderer import background_color
-    from octasplat.engine.render.supersampling import rays_per_pixel_side, render_averaged
+    from octasplat.engine.render.shots import scene_image
     from octasplat.engine.shading.plain import PLAIN_SHADING
+
+    is_lit = scene.materials is not None and bool(is_material_known(scene.gaussians).all())
+    if shading == "materials" and not is_lit:
+        raise ConfigError(
+            "The scene has no materials with a light that was learnt; load the folder of a run that was "
+            "reconstructed with materials, or leave out `shading`."
+        )
+    materials = scene.materials if is_lit and shading != "harmonics" else None
 
     behind = background_color(background) if isinstance(background, str) else np.array(background, np.float32)
     rays = camera.rays()
-    tracer = _build_tracer(scene, threads)
-    rendered = render_averaged(
-        tracer, rays, behind, PLAIN_SHADING, rays_per_pixel_side(rays, scene.facts.pixel_rad)
+    rendered = scene_image(
+        _build_tracer(scene, threads, materials),
+        rays,
+        behind,
+        trained_rad=scene.facts.pixel_rad,
+        shading=materials or PLAIN_SHADING,
+        gives_radiance=materials is not None,
     )
     return Image(
         rendered.rgb_srgb, rendered.depth, rendered.normal_world, rendered.alpha, scene, rays, threads
     )
 
 
-def _build_tracer(scene: Scene, threads: int) -> "Tracer":
+def _build_tracer(scene: Scene, threads: int, materials: "DeferredShading | None" = None) -> "Tracer":
     from octasplat.engine.trace.factory import make_tracer
     from octasplat.engine.trace.protocol import TraceSettings
 
     tracer = make_tracer(TraceSettings(flip_normal_cos=scene.facts.turned_beyond), threads=threads)
-    tracer.build(scene.gaussians)
+    tracer.build(scene.gaussians, None if materials is None else materials.features(scene.gaussians))
     return tracer

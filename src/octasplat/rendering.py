@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any, Unpack, overload
 
 from octasplat import verbs
 from octasplat.engine.render.pinhole_camera import PinholeCamera
-from octasplat.images import Background, Image, render_view
+from octasplat.images import Background, Image, Shading, render_view
 from octasplat.paths import PathLike
 from octasplat.scenes import Scene
 
@@ -14,7 +14,13 @@ if TYPE_CHECKING:
 
 @overload
 def render(
-    source: Scene, camera: PinholeCamera, /, *, background: Background = "black", threads: int = 0
+    source: Scene,
+    camera: PinholeCamera,
+    /,
+    *,
+    background: Background = "black",
+    shading: Shading | None = None,
+    threads: int = 0,
 ) -> Image: ...
 
 
@@ -33,8 +39,9 @@ def render(source: Scene | PathLike, target: PinholeCamera | PathLike, /, **opti
         source: the scene.
         target: the camera; :meth:`Scene.camera`, :meth:`Scene.turntable` and :meth:`Camera.looking_at` make
             some.
-        options: ``background``, what lies behind, by name or as display values in [0, 1]; ``threads``, of
-            which 0 takes all cores.
+        options: ``background``, what lies behind, by name or as display values in [0, 1]; ``shading``,
+            ``materials`` in the light that the run of the scene has learnt, which is the default where there
+            is one, or ``harmonics``; ``threads``, of which 0 takes all cores.
 
     >>> import octasplat as osp
     >>> scene = osp.load("scene.ply")

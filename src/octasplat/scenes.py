@@ -20,6 +20,7 @@ from octasplat.paths import PathLike
 
 if TYPE_CHECKING:
     from octasplat.engine.render.pinhole_camera import PinholeCamera
+    from octasplat.engine.shading.deferred import DeferredShading
 
 
 class Scene:
@@ -39,10 +40,22 @@ class Scene:
     >>> scene.means += np.float32([0, 0, 1])
     """
 
-    def __init__(self, gaussians: FlatGaussians, facts: SceneMetadata = UNKNOWN_METADATA) -> None:
-        """Take over the engine's Gaussians; :meth:`from_arrays` makes a scene of plain arrays."""
+    def __init__(
+        self,
+        gaussians: FlatGaussians,
+        facts: SceneMetadata = UNKNOWN_METADATA,
+        materials: "DeferredShading | None" = None,
+    ) -> None:
+        """Take over the engine's Gaussians; :meth:`from_arrays` makes a scene of plain arrays.
+
+        Args:
+            gaussians: the scene.
+            facts: what a file says of it as a whole.
+            materials: shading of its materials in the light that a run has learnt.
+        """
         self.gaussians = gaussians
         self.facts = facts
+        self.materials = materials
 
     @classmethod
     def from_arrays(
@@ -176,11 +189,11 @@ class Scene:
         >>> len(scene.select(scene.opacities > 0.5)) < len(scene)
         True
         """
-        return Scene(self.gaussians.select(index), self.facts)
+        return Scene(self.gaussians.select(index), self.facts, self.materials)
 
     def copy(self) -> "Scene":
         """Return an independent copy."""
-        return Scene(self.gaussians.copy(), self.facts)
+        return Scene(self.gaussians.copy(), self.facts, self.materials)
 
     def camera(self, width: int = 640, height: int = 480, *, fov: float = 50.0) -> "PinholeCamera":
         """Return a camera that sees the whole scene; ``fov`` is its angle of view in degrees, down.
@@ -274,7 +287,8 @@ def _opacity_logits(opacities: Float[np.ndarray, "..."]) -> Float64[np.ndarray, 
 def load(source: PathLike, *, drop_invalid: bool = False) -> Scene:
     """Return the scene of a file of any format, or of a run.
 
-    What reading loses, as the thickness of Gaussians that were not flat, is logged.
+    With a run comes the light that it has learnt, if it has materials; :func:`octasplat.render` shows them in
+    it. What reading loses, as the thickness of Gaussians that were not flat, is logged.
 
     Args:
         source: the file, a run or its folder, or the folder of an unpacked SOG.
@@ -282,6 +296,7 @@ def load(source: PathLike, *, drop_invalid: bool = False) -> Scene:
 
     Raises:
         SceneFileError: the file cannot be read.
+        ConfigError: a run's light cannot be read.
 
     >>> import octasplat as osp
     >>> osp.load("scene.ply")
@@ -295,11 +310,14 @@ def read_scene(path: Path, progress: EventListener, *, drop_invalid: bool = Fals
 
     Raises:
         SceneFileError: the file cannot be read.
+        ConfigError: a run's light cannot be read.
     """
     from octasplat.engine.files import read_metadata
     from octasplat.engine.operations.scene_io import open_scene
+    from octasplat.engine.runs.finished_shading import learned_materials
 
-    return Scene(open_scene(path, progress, drop_invalid=drop_invalid), read_metadata(path))
+    gaussians = open_scene(path, progress, drop_invalid=drop_invalid)
+    return Scene(gaussians, read_metadata(path), learned_materials(path, gaussians))
 
 
 def save(scene: Scene, path: PathLike) -> Path:

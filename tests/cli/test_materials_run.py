@@ -1,15 +1,23 @@
 """``reconstruct --materials``: what it leaves, and that a stopped run ends with the same bytes."""
 
 import json
+import shutil
 import signal
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+import octasplat as osp
+from octasplat.engine.core.color import linear_to_srgb
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
 from octasplat.engine.gaussians.materials import has_materials
-from octasplat.engine.render.environment_files import read_environment
+from octasplat.engine.render.environment_files import read_environment, write_environment
+from octasplat.engine.render.image_files import read_image
+from octasplat.engine.render.path_document import read_path_document
+from octasplat.engine.render.path_file import path_cameras
+from tests.support.image_channels import read_channels
 from tests.support.tiny_dataset import make_tiny_dataset
 
 MATERIALS = (
@@ -84,6 +92,51 @@ def test_render_of_materials_run_is_shaded_as_its_evaluation(materials_run, octa
     result = octasplat("render", materials_run, "--shading", "harmonics", "-o", tmp_path / "plain")
     assert result.exit_code == 0, result.output
     assert (tmp_path / "plain" / rendered[0].name).read_bytes() != rendered[0].read_bytes()
+
+
+def test_exr_of_materials_run_keeps_radiance_above_white(materials_run, octasplat, tmp_path):
+    """As ``relight`` has it in the same light; a PNG is clipped."""
+    bright = tmp_path / "bright"
+    shutil.copytree(materials_run, bright)
+    light = np.full((16, 32, 3), 4.0, np.float32)
+    write_environment(bright / "environment.exr", light)
+    camera = ("--camera", 0, -0.5, -2.5, "--width", 32, "--height", 24)
+    result = octasplat("render", bright, *camera, "-o", tmp_path / "a.exr")
+    assert result.exit_code == 0, result.output
+    red = read_channels(tmp_path / "a.exr")["R"]
+    assert red.max() > 1.5
+    result = octasplat("render", bright, *camera, "-o", tmp_path / "a.png")
+    assert result.exit_code == 0, result.output
+    shown = linear_to_srgb(np.clip(red, 0, 1))
+    assert np.abs(read_image(tmp_path / "a.png")[..., 0] - shown)[red > 1].max() < 0.2
+    inside = (red > 0.05) & (red < 0.5) & (read_channels(tmp_path / "a.exr")["A"] > 0.999)
+    assert np.abs(read_image(tmp_path / "a.png")[..., 0] - shown)[inside].max(initial=0) < 1 / 255
+
+
+def test_scene_of_materials_run_in_memory_shows_materials(materials_run, octasplat, tmp_path):
+    """The same picture as that of the command, also of a copy; harmonics where they are asked for."""
+    pose = [[1, 0, 0, 0], [0, 1, 0, -0.5], [0, 0, 1, -2.5], [0, 0, 0, 1]]
+    frames = [{"camera_to_world": pose, "fov_y_degrees": 50}]
+    (tmp_path / "path.json").write_text(json.dumps({"width": 64, "height": 48, "frames": frames}))
+    scene = osp.load(materials_run)
+    [given] = path_cameras(read_path_document(tmp_path / "path.json"), "path.json").cameras
+    camera = replace(given, near_world=scene.facts.near_world)
+    pictures = []
+    for shading in ("materials", "harmonics"):
+        output = tmp_path / f"{shading}.png"
+        command = ("render", materials_run, "--path", tmp_path / "path.json", "--shading", shading)
+        result = octasplat(*command, "-o", output)
+        assert result.exit_code == 0, result.output
+        osp.render(scene.copy(), camera, shading=shading).save(tmp_path / "memory.png")
+        assert (tmp_path / "memory.png").read_bytes() == output.read_bytes()
+        pictures.append(output.read_bytes())
+    osp.render(scene, camera).save(tmp_path / "default.png")
+    assert (tmp_path / "default.png").read_bytes() == pictures[0] != pictures[1]
+    of_file = osp.load(materials_run / "scene.ply")
+    osp.render(of_file, camera).save(tmp_path / "file.png")
+    assert (tmp_path / "file.png").read_bytes() == pictures[1]
+    with pytest.raises(osp.ConfigError, match="no materials with a light"):
+        osp.render(of_file, camera, shading="materials")
 
 
 def test_render_says_where_materials_cannot_be_shown(materials_run, octasplat, tmp_path):

@@ -39,7 +39,8 @@ def by_oiio(suffix: str, folder: Path, **attributes: Any) -> bytes:
     if attributes.get("tiled"):
         spec.tile_width = spec.tile_height = 32
     out = oiio.ImageOutput.create(str(path))
-    assert out.open(str(path), spec) and out.write_image(PIXELS) and out.close()
+    pixels = np.full_like(PIXELS, 128) if attributes.get("even") else PIXELS
+    assert out.open(str(path), spec) and out.write_image(pixels) and out.close()
     return path.read_bytes()
 
 
@@ -66,6 +67,7 @@ MADE = {
     "EXR": lambda folder: by_oiio("exr", folder, compression="zip"),
     "EXR of single rows": lambda folder: by_oiio("exr", folder, compression="zips"),
     "raw EXR": lambda folder: by_oiio("exr", folder, compression="none"),
+    "even HDR": lambda folder: by_oiio("hdr", folder, even=True),
     "EXR by PIZ": lambda folder: by_oiio("exr", folder, compression="piz"),
 }
 
@@ -88,6 +90,16 @@ def test_truncated_image_is_refused(tmp_path: Path, case: str) -> None:
 def test_image_with_trailing_data_is_accepted(tmp_path: Path, case: str) -> None:
     film = np.random.default_rng(2).integers(0, 200, 300_000, np.uint8).tobytes()
     assert look(MADE[case](tmp_path) + film) == ("PNG" if case == "PNG" else "JPEG")
+
+
+@pytest.mark.parametrize("size", [b"-Y 96 +X 128", b"+X 128 -Y 96"])
+def test_hdr_without_pixels_is_refused(size: bytes) -> None:
+    header = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n" + size + b"\n"
+    for pixels in (b"", b"0123456789", b"\2\2\0\x80" + b"\xff\1\x81\1" * 4):
+        with pytest.raises(IntakeError, match="cut off: the end of its HDR") as caught:
+            look(header + pixels)
+        assert caught.value.code == "image-cut-off"
+    assert look(header + PIXELS.tobytes() + bytes(128 * 96)) == "HDR"
 
 
 def test_complete_images_of_other_programs_are_accepted() -> None:

@@ -36,6 +36,7 @@ from tests.support.service_harness import (
 )
 
 TRIANGLE = b"v 0 0 0\nv .3 0 0\nv 0 -.3 0\nf 1 2 3\n"
+GLB = b"glTF\2\0\0\0\x30\0\0\0\x1c\0\0\0JSON" + b'{"asset":{"version":"2.0"}} '
 HDR = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 2\n" + bytes([128, 128, 128, 128] * 4)
 
 
@@ -136,7 +137,10 @@ async def test_stage_files_are_checked_on_upload(connect_service: ConnectService
         address = f"/v1/datasets/{dataset}/files/"
         for name, content, kind in [
             ("sky.hdr", b"no picture", "image-kind"),
+            ("sky.hdr", HDR[:-10], "image-cut-off"),
             ("thing.glb", TRIANGLE, "file-kind"),
+            ("thing.glb", b"glTF", "file-kind"),
+            ("thing.glb", GLB[:-1], "file-kind"),
             ("thing.obj", b"\0\1\2", "file-kind"),
             ("thing.obj", b"v 0 0 0\n# " + b"x" * 70_000 + b"\n", "file-kind"),
             ("..%2Fthing.obj", TRIANGLE, "name-traversal"),
@@ -150,7 +154,7 @@ async def test_stage_files_are_checked_on_upload(connect_service: ConnectService
         assert archive.status_code == 409
         empty = await http.post(f"/v1/datasets/{dataset}/commit")
         assert (empty.status_code, empty.json()["type"]) == (422, "urn:octasplat:problem:dataset-files")
-        for name, content in (("thing.obj", TRIANGLE), ("sky.hdr", HDR)):
+        for name, content in (("thing.obj", TRIANGLE), ("sky.hdr", HDR), ("thing.glb", GLB)):
             assert (await http.put(address + name, content=content)).status_code == 201
         source = await finished(http, service, {"scene.ply": b"ply"})
         body = {"kind": "render", "source_id": source, "options": {"stage": "[[meshes]]\nfile = 'thing.obj'"}}

@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from octasplat.engine.core.color import to_bytes
 from octasplat.engine.core.events import Event
 from octasplat.engine.core.rays import ImageRays, RayBatch
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.pipeline import OnStep, reconstruct
+from octasplat.engine.render.renderer import render_rays
 from octasplat.engine.shading.plain import PLAIN_SHADING
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.protocol import Tracer
@@ -64,22 +66,48 @@ def told_steps(run: Path, told: list[Event]) -> list[int]:
     return [event.step for event in found]
 
 
-def test_previews_do_not_change_training(scene: Path, tmp_path: Path, clock: Clock) -> None:
-    whole = reconstruct(scene, tmp_path / "whole", watched_config(), threads=1)
+@pytest.mark.parametrize("materials", [False, True])
+def test_previews_do_not_change_training(scene: Path, tmp_path: Path, clock: Clock, materials: bool) -> None:
+    config = watched_config(materials=materials)
+    whole = reconstruct(scene, tmp_path / "whole", config, threads=1)
     told: list[Event] = []
     run = tmp_path / "run"
     watch = watched(clock, PreviewRenderer(run, "black", told.append), 1.0)
-    reconstruct(scene, run, watched_config(), threads=1, on_step=watch)
+    reconstruct(scene, run, config, threads=1, on_step=watch)
     # At once, after 4 s, and then every 12 s; one that falls on a densification waits for the next iteration.
     steps = told_steps(run, told)
     assert len(steps) == 6 and steps[0] == 1
     assert all(12 <= b - a <= 14 for a, b in pairwise(steps[1:]))
     drawn_often = tmp_path / "often"
     watch = watched(clock, PreviewRenderer(drawn_often, "black", lambda _event: None), 60.0)
-    reconstruct(scene, drawn_often, watched_config(), threads=1, on_step=watch)
+    reconstruct(scene, drawn_often, config, threads=1, on_step=watch)
     for name in ("scene.ply", "mesh.ply", "checkpoints/best.npz", "renders/view_000.png"):
         expected = (whole / name).read_bytes()
         assert (run / name).read_bytes() == expected and (drawn_often / name).read_bytes() == expected
+
+
+def test_preview_shows_materials(scene: Path, tmp_path: Path) -> None:
+    """The newest picture is what the shading model of the training makes of the view, not its harmonics."""
+    run = tmp_path / "run"
+    previews = PreviewRenderer(run, "black", lambda _event: None)
+    shown = []
+
+    def watch(
+        iteration: int, dataset: Dataset, tracer: Tracer, shading: ShadingModel, _gaussians: FlatGaussians
+    ) -> None:
+        if iteration != 40:
+            return
+        previews(iteration, dataset, tracer, shading)
+        rays = preview.grid_rays(dataset, int(dataset.test_indices[0]), preview.MAX_SIDE_PX)
+        black = np.zeros(3, np.float32)
+        shown.extend(
+            to_bytes(render_rays(tracer, rays, black, by).rgb_srgb) for by in (shading, PLAIN_SHADING)
+        )
+
+    reconstruct(scene, run, watched_config(materials=True), threads=1, on_step=watch)
+    with Image.open(run / preview.PREVIEW_FILE) as picture:
+        values = np.asarray(picture)
+    assert (values == shown[0]).all() and (values != shown[1]).any()
 
 
 @pytest.mark.parametrize(("seconds_per_ray", "least_side_px"), [(1e-9, 320), (2e-5, 120), (1e-2, 96)])

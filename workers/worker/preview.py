@@ -16,7 +16,7 @@ from octasplat.engine.render.renderer import background_color, render_rays
 from octasplat.engine.shading.plain import PLAIN_SHADING
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.protocol import Tracer
-from octasplat.engine.train.shading_factory import find_background
+from octasplat.engine.train.shading_factory import find_background, find_deferred
 
 MAX_SIDE_PX = 320
 MIN_SIDE_PX = 96
@@ -66,8 +66,9 @@ class PreviewRenderer:
         # A view that is held out shows how the scene looks where nothing was fitted.
         chosen = int((dataset.test_indices if len(dataset.test_indices) else dataset.train_indices)[0])
         rays = grid_rays(dataset, chosen, self._side_px)
-        # A learnt background alone: materials would send rays of their own, which takes time.
-        image = render_rays(tracer, rays, self._background, find_background(shading) or PLAIN_SHADING)
+        # The background shades the materials before it, too.
+        shown = find_background(shading) or find_deferred(shading) or PLAIN_SHADING
+        image = render_rays(tracer, rays, self._background, shown)
         write_png(self._run / PREVIEW_FILE, image.rgb_srgb)
         self._listener(PreviewWritten(PREVIEW_FILE, iteration, dataset.views[chosen].name))
         spent = time.monotonic() - began
