@@ -64,7 +64,7 @@ MODES = {
 
 def stage(name: str) -> str:
     """Return the text of a mode's stage: the scene, a ball and a lamp, which is new in some."""
-    lamp = LAMP.replace("2.0", "1.2") + "adds_light = true\n" if name.startswith("new_light") else LAMP
+    lamp = LAMP + "adds_light = true\n" if name.startswith("new_light") else LAMP
     return f"[[gaussians]]\n{MODES[name]}\n{BALL}{lamp}[integrator]\nsamples = 64\n"
 
 

@@ -46,6 +46,10 @@ def _placed_about(part: PlacedT, key: str, origin: Origin, moved: list[str]) -> 
         if place is not None and _is_far(place, origin):
             changes[name] = tuple(float(x) for x in np.array(place) - np.array(origin))
             moved.append(f"{key}.{name}")
+    if keys := getattr(part, "keys", ()):
+        changes["keys"] = tuple(
+            _placed_about(each, f"{key}.keys[{number}]", origin, moved) for number, each in enumerate(keys)
+        )
     rest = getattr(part, "on", None)
     if rest is not None:
         changes["on"] = _placed_about(rest, f"{key}.on", origin, moved)

@@ -12,9 +12,10 @@ from octasplat.engine.core.local_origin import is_set
 from octasplat.engine.core.progress import counted_phase
 from octasplat.engine.pathtracing.compile_meshes import CompiledMeshes, check_outside_glass, compile_meshes
 from octasplat.engine.pathtracing.film import StageImage
-from octasplat.engine.pathtracing.gaussian_layers import build_gaussian_layers
+from octasplat.engine.pathtracing.gaussian_layers import GaussianLayers, build_gaussian_layers
 from octasplat.engine.pathtracing.path_tracer import PathTracer, PathTracerScene
 from octasplat.engine.pathtracing.stage.model import Integrator, Stage
+from octasplat.engine.pathtracing.stage.motion import is_moving, stage_at
 from octasplat.engine.pathtracing.stage_origin import places_note, stage_about
 from octasplat.engine.pathtracing.stage_placement import place_resting_meshes
 from octasplat.engine.pathtracing.stage_scene import SIZE_PER_RADIUS, StageScene
@@ -27,17 +28,17 @@ class StageRenderer:
     """A stage that is ready to be rendered.
 
     Attributes:
-        tracer: of the stage.
+        tracer_at: returns the tracer of the stage as it is in a shot.
         settings: how to trace.
     """
 
-    tracer: PathTracer
+    tracer_at: Callable[[Shot], PathTracer]
     settings: Integrator
 
     @property
     def render_fn(self) -> RenderFn:
         """Return the function that renders a shot to a file."""
-        return stage_render_fn(self.tracer, self.settings)
+        return stage_render_fn(self.tracer_at, self.settings)
 
     def preview(self, shot: Shot, output: Path, progress: EventListener) -> None:
         """Render one shot to a file, progressively.
@@ -46,7 +47,9 @@ class StageRenderer:
             OutputError: it cannot be written.
         """
         with counted_phase("render", progress) as count:
-            render_preview(self.tracer, self.settings, shot, output, lambda done, of: count(0, 1, done / of))
+            render_preview(
+                self.tracer_at(shot), self.settings, shot, output, lambda done, of: count(0, 1, done / of)
+            )
             count(1, 1)
 
 
@@ -56,10 +59,11 @@ def compile_stage(stage: Stage, scene: StageScene, shots: Sequence[Shot]) -> Sta
     Args:
         stage: meshes, lights, environment and how the scene takes part.
         scene: the scene that it is put into.
-        shots: what is to be rendered.
+        shots: what is to be rendered; keys of the stage count these.
 
     Raises:
-        OctasplatError: something of the stage cannot be used, or a camera stands in glass.
+        OctasplatError: something of the stage cannot be used, or a camera stands in glass; where things
+            move, their later places are looked at when they are rendered.
     """
     stage, moved = stage_about(stage, scene.origin_world)
     if is_set(scene.origin_world):
@@ -69,6 +73,30 @@ def compile_stage(stage: Stage, scene: StageScene, shots: Sequence[Shot]) -> Sta
         stage, scene.gaussians, scene.read_gaussians, scene.folder, scene.settings,
         size=SIZE_PER_RADIUS * scene.turntable(np.array(stage.up)).radius, threads=scene.threads,
     )  # fmt: skip
+    first = _tracer_of(
+        stage_at(stage, 0), scene, layers, shots[:1] if is_moving(stage) else shots, scene.warn
+    )
+    if not is_moving(stage):
+        return StageRenderer(lambda _shot: first, stage.integrator)
+    frames = {shot.name: number for number, shot in enumerate(shots)}
+
+    def tracer_at(shot: Shot) -> PathTracer:
+        if frames[shot.name] == 0:
+            return first
+        # what is odd about a file was told of the first image
+        return _tracer_of(stage_at(stage, frames[shot.name]), scene, layers, (shot,), _ignore)
+
+    return StageRenderer(tracer_at, stage.integrator)
+
+
+def _tracer_of(
+    stage: Stage,
+    scene: StageScene,
+    layers: GaussianLayers | None,
+    shots: Sequence[Shot],
+    warn: Callable[[str], None],
+) -> PathTracer:
+    """Return the tracer of a stage in which nothing moves, among Gaussians that are built already."""
     stage = place_resting_meshes(
         stage,
         None if layers is None else layers.tracer,
@@ -77,29 +105,33 @@ def compile_stage(stage: Stage, scene: StageScene, shots: Sequence[Shot]) -> Sta
         scene.origin_world,
     )
     meshes = compile_meshes(
-        stage, scene.folder, threads=scene.threads, warn=scene.warn, origin_world=scene.origin_world
+        stage, scene.folder, threads=scene.threads, warn=warn, origin_world=scene.origin_world
     )
     check_cameras_outside_glass(meshes, shots)
     background = srgb_to_linear(scene.background_srgb.astype(np.float64))
     only_environment = stage.model_copy(update={"meshes": (), "lights": ()})
     environment = compile_meshes(only_environment, scene.folder, threads=scene.threads)
     lit = PathTracerScene(meshes, layers, background, environment)
-    return StageRenderer(PathTracer(lit, stage.integrator, threads=scene.threads), stage.integrator)
+    return PathTracer(lit, stage.integrator, threads=scene.threads)
 
 
-def stage_render_fn(tracer: PathTracer, settings: Integrator) -> RenderFn:
+def _ignore(_sentence: str) -> None:
+    """Tell nobody."""
+
+
+def stage_render_fn(tracer_at: Callable[[Shot], PathTracer], settings: Integrator) -> RenderFn:
     """Return the function that renders a shot of a stage to a file.
 
     ``.exr`` gets the linear picture before exposure and tone curve as R, G, B, and alpha as A; anything else
     gets 8-bit display values.
 
     Args:
-        tracer: of the stage.
+        tracer_at: returns the tracer of the stage as it is in a shot.
         settings: with exposure and tone curve.
     """
 
     def paint(shot: Shot, path: Path, part: Callable[[float], None]) -> None:
-        film = tracer.render(shot.rays(), lambda done, of: part(done / of))
+        film = tracer_at(shot).render(shot.rays(), lambda done, of: part(done / of))
         write_stage_image(path, film.image(exposure=settings.exposure, tone=settings.tone))
 
     return paint

@@ -22,6 +22,7 @@ from octasplat.engine.pathtracing.stage.base import (
     Vector,
 )
 from octasplat.engine.pathtracing.stage.materials import Material
+from octasplat.engine.pathtracing.stage.motion import Keys, LightKey, MeshKey, check_keys
 
 MAX_MESHES = 1000
 MAX_LIGHTS = 1000
@@ -72,6 +73,7 @@ class StageMesh(Transformed):
         material: what it is made of; by default what the file says of its materials and colors, or else a
             matt grey.
         on: a place in the scene on which it stands; its position counts from there.
+        keys: where it is in single images of a film.
     """
 
     file: str | None = None
@@ -81,9 +83,11 @@ class StageMesh(Transformed):
     smooth_degrees: Annotated[float, Field(ge=0, le=180)] | None = None
     material: Material | None = None
     on: RestingPlace | None = None
+    keys: Keys[MeshKey] = ()
 
     @model_validator(mode="after")
     def _check_one_source(self) -> "StageMesh":
+        check_keys(self.keys, ("position", "turn_degrees"))
         if (self.file is None) == (self.shape is None):
             raise ValueError("give either a file or a shape")
         return self
@@ -96,10 +100,17 @@ class LightModel(StageModel):
         color_srgb: of the light.
         adds_light: whether it adds its light to shadowed Gaussians. Otherwise their colors hold it already,
             and they only lose it where something new is in its way.
+        keys: where it is in single images of a film.
     """
 
     color_srgb: Color = WHITE
     adds_light: bool = False
+    keys: Keys[LightKey] = ()
+
+    @model_validator(mode="after")
+    def _check_keys(self) -> "LightModel":
+        check_keys(self.keys, tuple(type(self).model_fields))
+        return self
 
 
 class PointLight(LightModel):
