@@ -64,7 +64,7 @@ MODES = {
 
 def stage(name: str) -> str:
     """Return the text of a mode's stage: the scene, a ball and a lamp, which is new in some."""
-    lamp = LAMP + "adds_light = true\n" if name.startswith("new_light") else LAMP
+    lamp = LAMP.replace("2.0", "1.2") + "adds_light = true\n" if name.startswith("new_light") else LAMP
     return f"[[gaussians]]\n{MODES[name]}\n{BALL}{lamp}[integrator]\nsamples = 64\n"
 
 
@@ -105,7 +105,6 @@ def commands(folder: Path) -> dict[Path, list[str]]:
     relight = ["relight", "gold.ply", "--environment", "studio.hdr", "--up", "-y"]
     found[DOCS / "materials" / "harmonics.png"] = ["render", "gold.ply"]
     found[DOCS / "materials" / "split_sum.png"] = relight
-    found[DOCS / "materials" / "path.png"] = [*relight, "--integrator", "path", "--samples", "128"]
     found[DOCS / "materials" / "background.png"] = [*relight, "--background", "environment"]
     return found
 
