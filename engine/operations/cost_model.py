@@ -175,6 +175,19 @@ def estimate_reconstruction(
     return found.model_copy(update={"poses_seconds": round(share * found.seconds, 1)})
 
 
+def gaussians_within(
+    options: ReconstructionConfig, photographs: Sequence[ImageSizes], memory_bytes: int
+) -> int:
+    """Return how many Gaussians a training in so much memory may have; 0 where it holds not even the rest."""
+    train = options.train
+    shrunk = [_capped_sizes(sizes, options.max_side) for sizes in photographs]
+    largest = max((sizes.width_px * sizes.height_px for sizes in shrunk), default=0)
+    if memory_bytes < _START_BYTES + _PIXEL_BYTES * largest:
+        return 0
+    left = memory_bytes - _START_BYTES - _RAY_BYTES * max(train.rays_per_batch, train.probe_rays)
+    return max(0, left // _gaussian_bytes(train.sh_degree))
+
+
 def _pose_search_cpu_seconds(photographs: Sequence[ImageSizes]) -> dict[str, float]:
     """Return the time to find the poses of photographs by stage, if one search places them all."""
     shrunk = [_capped_sizes(sizes, MAX_IMAGE_SIDE_PX) for sizes in photographs]

@@ -3,12 +3,13 @@
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import Field, ValidationError
 
 from octasplat.engine.core.events import EventListener, ignore_events
 from octasplat.engine.operations.base import Operation, Options, Output, Request, Result, never_stop
+from octasplat.engine.operations.block_options import BlockOptions, block_request
 from octasplat.engine.runs.run_settings import RunSettings
 from octasplat.engine.settings import renamed_settings
 from octasplat.engine.settings.fields import (
@@ -24,7 +25,7 @@ from octasplat.engine.settings.nested_options import merge_options
 from octasplat.engine.settings.refusals import InvalidSettingsError, refusals_from
 
 if TYPE_CHECKING:
-    from octasplat.engine.pipeline import BlockRequest, OnStep
+    from octasplat.engine.pipeline import OnStep
     from octasplat.engine.runs.config import ReconstructionConfig
 
 _CONFIG, _METRICS, _REPORT, _SCENE = "config.json", "metrics.json", "report.html", "scene.ply"
@@ -141,7 +142,7 @@ class ReconstructOptions(RunSettings, Options):
         }
 
 
-class ReconstructRequest(ReconstructOptions, Request):
+class ReconstructRequest(ReconstructOptions, BlockOptions, Request):
     """Reconstruct SCENE, a folder with images/ and a COLMAP model in sparse/0, or with photographs alone.
 
     Where there is no model, COLMAP finds the poses of the photographs. SCENE may also be a video: its
@@ -164,11 +165,6 @@ class ReconstructRequest(ReconstructOptions, Request):
         False,
         description="Go on with the run in the output folder, if there is one; without other options its own "
         "settings are taken.",
-    )
-    blocks: Annotated[int, Field(ge=1, le=10_000)] | Literal["auto"] | None = Field(
-        None,
-        description="Train the scene in so many blocks, one after the other; auto takes the fewest that the "
-        "number of photographs and the memory ask for, which is 1 for most scenes.",
     )
 
 
@@ -228,7 +224,7 @@ def run_config(request: ReconstructRequest) -> "ReconstructionConfig":
 
     # with options the request's configuration counts, and is checked against the run's
     given = request.model_fields_set - {
-        *("source", "output", "resume", "exports", "frames_per_second", "blocks")
+        *("source", "output", "resume", "exports", "frames_per_second", "blocks", "memory")
     }  # fmt: skip
     # empty ones say nothing, whoever filled them in
     given -= {name for name in ("train", "assignments") if not getattr(request, name)}
@@ -246,15 +242,6 @@ def scene_folder(request: ReconstructRequest) -> Path:
 
     source = request.source
     return request.output.with_name(f"{request.output.name}-frames") if is_video(source) else source
-
-
-def _block_request(request: ReconstructRequest) -> "BlockRequest | None":
-    """Return how the request wants the scene to be trained in blocks; None where it does not say."""
-    from octasplat.engine.pipeline import BlockRequest
-
-    if request.blocks is None:
-        return None
-    return BlockRequest(count=None if request.blocks == "auto" else request.blocks)
 
 
 def _take_frames(request: ReconstructRequest, folder: Path, progress: EventListener) -> None:
@@ -303,8 +290,14 @@ def run(
     scene = scene_folder(request)
     if scene != request.source:  # the source is a video
         _take_frames(request, scene, stop_when_asked(progress, should_stop))
+    located, blocks = locate_scene(scene), None
+    if request.blocks is not None or request.memory is not None:
+        from octasplat.engine.operations.estimate import photograph_sizes
+
+        sizes = photograph_sizes(located) if request.memory is not None else []
+        blocks = block_request(request, config, sizes)
     reconstruct(
-        locate_scene(scene),
+        located,
         output,
         config,
         resume=request.resume,
@@ -312,7 +305,7 @@ def run(
         progress=stop_when_asked(progress, should_stop),
         should_stop=should_stop,
         on_step=on_step,
-        blocks=_block_request(request),
+        blocks=blocks,
     )
     return ReconstructResult(
         files=tuple(output / name for name in (_SCENE, *config.exports, _METRICS, _REPORT)),

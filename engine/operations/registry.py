@@ -10,6 +10,7 @@ from octasplat.engine.operations.base import Operation
 _MODULES = {
     "reconstruct": "reconstruct",
     "estimate": "estimate",
+    "plan": "plan",
     "evaluate": "evaluate",
     "info": "info",
     "surface": "surface",

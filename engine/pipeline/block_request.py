@@ -12,7 +12,7 @@ from octasplat.engine.core.writing import write_text
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.runs.run_folder import BLOCKS
-from octasplat.engine.train.config import max_gaussian_count
+from octasplat.engine.train.config import TrainConfig, max_gaussian_count
 from octasplat.engine.train.sampling.pixel_sampler import valid_pixel_fraction
 
 AUTO_VIEWS = 500
@@ -43,17 +43,29 @@ class BlockRequest(BaseModel):
         Raises:
             ConfigError: settings with which a scene is not trained in blocks.
         """
-        count = self.count or self._fewest(config, dataset)
+        count = self.count
+        if count is None:
+            valid = valid_pixel_fraction(dataset) if self.most_gaussians is not None else 1.0
+            count = self.fewest(config.train, len(dataset.train_indices), dataset.train_pixel_count, valid)
         if count > 1:
             require_blocks_possible(config.train, has_time_budget=config.minutes is not None)
         return count
 
-    def _fewest(self, config: ReconstructionConfig, dataset: Dataset) -> int:
-        by_views = math.ceil(len(dataset.train_indices) / AUTO_VIEWS)
+    def fewest(
+        self, config: TrainConfig, views: int, training_pixels: int, valid_fraction: float = 1.0
+    ) -> int:
+        """Return the fewest blocks for so many training views and pixels of them.
+
+        Args:
+            config: settings of the training.
+            views: number of training views.
+            training_pixels: of all of them.
+            valid_fraction: share of the pixels that shows anything.
+        """
+        by_views = math.ceil(views / AUTO_VIEWS)
         if self.most_gaussians is None:
             return by_views
-        pixels, valid = dataset.train_pixel_count, valid_pixel_fraction(dataset)
-        wanted = max_gaussian_count(config.train, pixels, valid)
+        wanted = max_gaussian_count(config, training_pixels, valid_fraction)
         if wanted <= self.most_gaussians:
             return by_views
         # blocks overlap by their margins

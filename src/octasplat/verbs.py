@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from octasplat.engine.operations.info import InfoResult
     from octasplat.engine.operations.material import MaterialResult
     from octasplat.engine.operations.merge import MergeResult
+    from octasplat.engine.operations.plan import PlanResult
     from octasplat.engine.operations.relight import RelightResult
     from octasplat.engine.operations.render import RenderResult
     from octasplat.engine.operations.stage_init import StageInitResult
@@ -77,6 +78,8 @@ def reconstruct(
     source: PathLike,
     output: PathLike,
     *,
+    blocks: int | Literal["auto"] | None = None,
+    memory: str | None = None,
     preset: Literal["fast", "standard", "high", "redisplats"] | None = None,
     max_side: int | None = None,
     test_every: int | None = None,
@@ -100,7 +103,6 @@ def reconstruct(
     assignments: Sequence[str] | None = None,
     frames_per_second: float | None = None,
     resume: bool = False,
-    blocks: int | Literal["auto"] | None = None,
     on_step: OnStep | None = None,
     progress: EventListener | None = None,
     should_stop: Callable[[], bool] = never_stop,
@@ -111,6 +113,10 @@ def reconstruct(
     Args:
         source: The folder of the photographs, or a video.
         output: Folder for the results.
+        blocks: Train the scene in so many blocks, one after the other; auto takes the fewest that the
+            number of photographs and the memory ask for, which is 1 for most scenes.
+        memory: With blocks: about the most memory that the training of one takes, such as 8G; blocks
+            have no more Gaussians than that holds.
         preset: Where the settings of the training come from. fast: a first look, the fastest and less
             sharp than standard; standard: the usual choice, sharp enough for most uses; high: for a
             final result: a little sharper than standard where photographs are many and sharp, slower
@@ -156,8 +162,6 @@ def reconstruct(
             Default: 2.0.
         resume: Go on with the run in the output folder, if there is one; without other options its own
             settings are taken.
-        blocks: Train the scene in so many blocks, one after the other; auto takes the fewest that the
-            number of photographs and the memory ask for, which is 1 for most scenes.
         on_step: called with the state of the training every few iterations; returning False stops it
             after a checkpoint, and the run that is returned is unfinished. With ``resume=True`` another
             call goes on.
@@ -181,6 +185,8 @@ def reconstruct(
     """
     return reconstruct_run(
         {
+            "blocks": blocks,
+            "memory": memory,
             "preset": preset,
             "max_side": max_side,
             "test_every": test_every,
@@ -206,7 +212,6 @@ def reconstruct(
             "output": output,
             "frames_per_second": frames_per_second,
             "resume": resume,
-            "blocks": blocks,
         },
         on_step,
         progress,
@@ -332,6 +337,142 @@ def estimate(
             "cores": cores,
             "source": source,
             "frames_per_second": frames_per_second,
+        },
+        progress,
+        should_stop,
+        threads,
+    )
+
+
+@names_checked
+def plan(
+    source: PathLike,
+    *,
+    overwrite: bool = False,
+    blocks: int | Literal["auto"] | None = None,
+    memory: str | None = None,
+    preset: Literal["fast", "standard", "high", "redisplats"] | None = None,
+    max_side: int | None = None,
+    test_every: int | None = None,
+    held_out: Sequence[str] | None = None,
+    split: Literal["given", "every"] | None = None,
+    burst_length: int | None = None,
+    poses: Literal["given", "auto", "missing"] | None = None,
+    model: str | None = None,
+    masks: Literal["ignore", "alpha"] | None = None,
+    evaluation_background: Literal["black", "white"] | None = None,
+    minutes: float | None = None,
+    exports: Sequence[str] | None = None,
+    materials: bool = False,
+    for_surface: bool = False,
+    iterations: int | None = None,
+    rays_per_batch: int | None = None,
+    max_gaussians: int | None = None,
+    sh_degree: int | None = None,
+    seed: int | None = None,
+    train: Mapping[str, Any] | None = None,
+    assignments: Sequence[str] | None = None,
+    cores: int | None = None,
+    picture: PathLike | None = None,
+    progress: EventListener | None = None,
+    should_stop: Callable[[], bool] = never_stop,
+    threads: int = 0,
+) -> "PlanResult":
+    """Plan the blocks of a large capture: how many, their time and memory.
+
+    Args:
+        source: The folder of the photographs and their model.
+        overwrite: Replace files that are there already, too, which are not of an earlier run of this
+            command or were changed since. What is read is never replaced.
+        blocks: Train the scene in so many blocks, one after the other; auto takes the fewest that the
+            number of photographs and the memory ask for, which is 1 for most scenes.
+        memory: With blocks: about the most memory that the training of one takes, such as 8G; blocks
+            have no more Gaussians than that holds.
+        preset: Where the settings of the training come from. fast: a first look, the fastest and less
+            sharp than standard; standard: the usual choice, sharp enough for most uses; high: for a
+            final result: a little sharper than standard where photographs are many and sharp, slower
+            and with more Gaussians; redisplats: the settings that the paper REdiSplats published, to
+            compare with it, for a scene of your own, standard is better. Default: standard.
+        max_side: Longest side to which photographs are shrunk; by default they keep their size. Set it
+            for a quick try, or where memory is short.
+        test_every: Every N-th view by name is held out to be measured; 0 holds out none, so that all
+            are trained on. Default: 8.
+        held_out: Names of the views to hold out instead of every N-th.
+        split: Which views are held out where the scene says so itself (transforms_test.json): given
+            follows it, every takes every N-th view all the same. Default: given.
+        burst_length: So many views that follow each other by name, as frames of a video or shots of a
+            burst, count as one where views are held out, so that none is measured by its neighbour.
+            Photographs that are there twice always do. Default: 1.
+        poses: Where the poses of the cameras come from: given takes the COLMAP model of the dataset
+            (photographs far from where matches put them are moved, see repair_poses); auto finds the
+            poses, by COLMAP's features, matching and mapping; missing does so only where the dataset
+            holds no model. Default: missing.
+        model: Which of several models of the dataset gives the poses: its folder or its number, e.g.
+            sparse/1, or transforms.json; by default the COLMAP model of most photographs.
+        masks: What masks mean: ignore leaves masked pixels out of the loss, alpha takes the mask as the
+            alpha, for objects that are cut out. Default: ignore.
+        evaluation_background: What lies behind renders and photographs with alpha when they are
+            compared; by default that of the training: white where train.background is white, else
+            black.
+        minutes: Time in which the training is to end, which decides its iterations and Gaussians by the
+            pace of the machine that begins it; by default the other settings do.
+        exports: Files to write besides scene.ply; their names say the format. Default: ('viewer.glb',
+            'surface.glb', 'octagons.ply', 'octagons.obj', 'octagons.glb').
+        materials: Learn materials and the environment of shiny things; environment.hdr lies beside the
+            scene then.
+        for_surface: Hold normals and depths together, so that a surface made of the scene is smoother.
+        iterations: Iterations of the training; 0 asks the photographs' pixels.
+        rays_per_batch: Rays of one iteration.
+        max_gaussians: Most Gaussians; 0, the default, asks the photographs' pixels.
+        sh_degree: Degree of the spherical harmonics of the colors, 0 to 3.
+        seed: Seed of everything random. [default: 0]
+        train: Settings of the training that are to be otherwise than the preset's.
+        assignments: Any other setting, e.g. lr.quat=0.02 or test_every=4, values as JSON; octasplat
+            config list shows them.
+        cores: Cores of the machine to reckon with; 0 takes those of this one. Default: 0.
+        picture: Write a map of the points from above, a color a block, and of the cameras, in black.
+        progress: told each event; by default they are logged, or shown in a notebook.
+        should_stop: asked now and then; True ends the work with ``CancelledError``.
+        threads: number of threads; 0 takes all cores. The result does not depend on it.
+
+    Raises:
+        OctasplatError: something cannot be read, done or written; the text says what.
+
+    >>> import octasplat as osp
+    >>> found = osp.plan("photos", blocks=2)
+    >>> len(found.blocks), found.seconds > 0
+    (2, True)
+    """
+    return run_operation(
+        "plan",
+        {
+            "overwrite": overwrite,
+            "blocks": blocks,
+            "memory": memory,
+            "preset": preset,
+            "max_side": max_side,
+            "test_every": test_every,
+            "held_out": held_out,
+            "split": split,
+            "burst_length": burst_length,
+            "poses": poses,
+            "model": model,
+            "masks": masks,
+            "evaluation_background": evaluation_background,
+            "minutes": minutes,
+            "exports": exports,
+            "materials": materials,
+            "for_surface": for_surface,
+            "iterations": iterations,
+            "rays_per_batch": rays_per_batch,
+            "max_gaussians": max_gaussians,
+            "sh_degree": sh_degree,
+            "seed": seed,
+            "train": train,
+            "assignments": assignments,
+            "cores": cores,
+            "source": source,
+            "picture": picture,
         },
         progress,
         should_stop,

@@ -7,6 +7,12 @@ EXAMPLES = {
 >>> found.cores, found.seconds > 0
 (8, True)
 """,
+    "plan": """
+>>> import octasplat as osp
+>>> found = osp.plan("photos", blocks=2)
+>>> len(found.blocks), found.seconds > 0
+(2, True)
+""",
     "evaluate": """
 >>> import octasplat as osp
 >>> found = osp.evaluate("run")

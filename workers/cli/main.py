@@ -35,6 +35,7 @@ _SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
     "From photographs to a scene": {
         "demo": ("demo", "Try everything on a generated scene."),
         "estimate": ("estimate", "Estimate what a reconstruction takes, before it is begun."),
+        "plan": ("plan", "Plan the blocks of a large capture: how many, their time and memory."),
         "reconstruct": ("reconstruct", "Photographs to a scene, its meshes, and measurements."),
         "evaluate": ("evaluate", "Measure a finished run again."),
     },

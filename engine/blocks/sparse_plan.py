@@ -1,0 +1,129 @@
+"""Blocks planned from the sparse points alone, in seconds and before anything is trained."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64
+
+from octasplat.engine.blocks.block_plan import MARGIN
+from octasplat.engine.blocks.partition import Box, cut_into_boxes, weighted_spread
+from octasplat.engine.blocks.pixel_selection import ViewTiles
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.dataset.model import DatasetModel
+
+MAP_SIDE_PX, MAP_BORDER_PX = 800, 20
+
+
+@dataclass(frozen=True, eq=False)
+class SparseBlock:
+    """A block as the sparse points suggest it.
+
+    Attributes:
+        core: its box.
+        share: of what is seen, in the core and its margin.
+        view_count: training views that show some of it.
+        pixel_count: pixels of them in tiles that show some of it.
+    """
+
+    core: Box
+    share: float
+    view_count: int
+    pixel_count: int
+
+
+def plan_from_points(
+    model: DatasetModel, train_indices: Int64[np.ndarray, " t"], count: int
+) -> tuple[SparseBlock, ...]:
+    """Cut the sparse points of a scene into blocks that about as many observations fall to.
+
+    Args:
+        model: views, points and observations.
+        train_indices: views to train on.
+        count: number of blocks.
+
+    Raises:
+        ConfigError: there are too few points that were observed.
+    """
+    is_trained = np.isin(model.observations.view, train_indices)
+    view, point_ids = model.observations.view[is_trained], model.observations.point[is_trained]
+    xy_px = model.observations.xy_px[is_trained]
+    # ids ascend
+    rows = np.minimum(np.searchsorted(model.points.ids, point_ids), max(len(model.points) - 1, 0))
+    if len(model.points) == 0 or len(rows) == 0:
+        raise ConfigError(
+            f"The model in {model.model_folder} has no points that photographs show, by which blocks are "
+            "planned; reconstruct cuts by its coarse scene."
+        )
+    points = model.points.xyz_world.astype(np.float64)
+    weights = np.bincount(rows, minlength=len(points)).astype(np.float64)
+    found = []
+    for box in cut_into_boxes(points, weights, count):
+        inside = box.contains(points) & (weights > 0)
+        margin_world = MARGIN * weighted_spread(points[inside], weights[inside])
+        member = box.grown(margin_world).contains(points)
+        pixels = [
+            _pixels_of_view(model, index, xy_px[view == index], member[rows[view == index]])
+            for index in train_indices.tolist()
+        ]
+        share = float(weights[member].sum() / weights.sum())
+        found.append(SparseBlock(box, share, int(np.count_nonzero(pixels)), round(sum(pixels))))
+    return tuple(found)
+
+
+def _pixels_of_view(
+    model: DatasetModel, index: int, xy_px: Float64[np.ndarray, "k 2"], member: Bool[np.ndarray, " k"]
+) -> float:
+    """Return the pixels of a view in tiles that show members; tiles without any point count in proportion."""
+    view = model.views[index]
+    tiles = ViewTiles.of_view(index, view.width_px, view.height_px)
+    down, across = tiles.shape
+    row = np.clip(np.searchsorted(tiles.rows_px, xy_px[:, 1], side="right") - 1, 0, down - 1)
+    column = np.clip(np.searchsorted(tiles.columns_px, xy_px[:, 0], side="right") - 1, 0, across - 1)
+    place = row * across + column
+    known = len(np.unique(place))
+    return view.width_px * view.height_px * len(np.unique(place[member])) / known if known else 0.0
+
+
+def draw_map(model: DatasetModel, cores: Sequence[Box]) -> Float32[np.ndarray, "h w 3"]:
+    """Return a picture of the points along the axis of least spread, a color a block, cameras black.
+
+    Args:
+        model: views and points.
+        cores: boxes of the blocks.
+    """
+    points = model.points.xyz_world.astype(np.float64)
+    weights = np.maximum(model.points.track_lengths, 1).astype(np.float64)
+    cameras = np.stack([view.origin_world for view in model.views])
+    spread = weighted_spread(points, weights)
+    axes = np.sort(np.argsort(spread, kind="stable")[1:])
+    # most of the points and most of the cameras, whichever reach farther
+    ranges = [np.quantile(places[:, axes], [0.02, 0.98], axis=0) for places in (cameras, points)]
+    low, high = np.minimum(ranges[0][0], ranges[1][0]), np.maximum(ranges[0][1], ranges[1][1])
+    scale = (MAP_SIDE_PX - 2 * MAP_BORDER_PX) / max(float((high - low).max()), 1e-12)
+    size = np.ceil((high - low) * scale).astype(np.int64) + 2 * MAP_BORDER_PX
+    image = np.ones((size[1], size[0], 3), np.float32)
+    for number, core in enumerate(cores):
+        _draw_dots(image, (points[core.contains(points)][:, axes] - low) * scale, _color(number), 1)
+    _draw_dots(image, (cameras[:, axes] - low) * scale, np.zeros(3), 2)
+    return image
+
+
+def _draw_dots(
+    image: Float32[np.ndarray, "h w 3"], xy: Float64[np.ndarray, "n 2"], color: np.ndarray, radius: int
+) -> None:
+    """Draw squares of ``2 radius - 1`` pixels a side, those outside of the picture left out."""
+    height, width = image.shape[:2]
+    column, row = np.rint(xy + MAP_BORDER_PX).astype(np.int64).T
+    for down in range(1 - radius, radius):
+        for right in range(1 - radius, radius):
+            y, x = row + down, column + right
+            inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
+            image[y[inside], x[inside]] = color
+
+
+def _color(number: int) -> Float64[np.ndarray, "3"]:
+    """Return a color that differs from those of the numbers before: hues at steps of the golden section."""
+    hue = number * 0.618034 % 1.0
+    wave = np.abs((hue * 6 + np.array([0.0, 4.0, 2.0])) % 6 - 3) - 1
+    return 0.15 + 0.75 * np.clip(wave, 0, 1)

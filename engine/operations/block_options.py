@@ -1,0 +1,65 @@
+"""Options of scenes that are trained in blocks, and the request that they mean."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from pydantic import Field
+
+from octasplat.engine.core.byte_sizes import parse_bytes
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.dataset.image_sizes import ImageSizes
+from octasplat.engine.operations.base import Options
+from octasplat.engine.settings.fields import Spelling
+
+if TYPE_CHECKING:
+    from octasplat.engine.pipeline import BlockRequest
+    from octasplat.engine.runs.config import ReconstructionConfig
+
+MIN_GAUSSIANS = 5_000
+"""Fewer in a block are not worth one."""
+
+
+class BlockOptions(Options):
+    """How a scene is cut into blocks."""
+
+    blocks: Annotated[int, Field(ge=1, le=10_000)] | Literal["auto"] | None = Field(
+        None,
+        description="Train the scene in so many blocks, one after the other; auto takes the fewest that the "
+        "number of photographs and the memory ask for, which is 1 for most scenes.",
+    )
+    memory: Annotated[str | None, Spelling(metavar="SIZE")] = Field(
+        None,
+        description="With blocks: about the most memory that the training of one takes, such as 8G; blocks "
+        "have no more Gaussians than that holds.",
+    )
+
+
+def block_request(
+    options: BlockOptions, config: "ReconstructionConfig", sizes: Sequence[ImageSizes]
+) -> "BlockRequest | None":
+    """Return how a scene is to be trained in blocks; None where the options do not say.
+
+    Args:
+        options: of the request.
+        config: of the reconstruction.
+        sizes: of the photographs.
+
+    Raises:
+        ConfigError: the memory is given without blocks, is no size, or holds no block.
+    """
+    from octasplat.engine.operations.cost_model import gaussians_within
+    from octasplat.engine.pipeline import BlockRequest
+
+    if options.blocks is None:
+        if options.memory is not None:
+            raise ConfigError("--memory is that of a block; say --blocks auto, too.")
+        return None
+    most = None
+    if options.memory is not None:
+        most = gaussians_within(config, sizes, parse_bytes(options.memory))
+        if most < MIN_GAUSSIANS:
+            raise ConfigError(
+                f"--memory {options.memory} holds no block: what a training takes besides its Gaussians is "
+                "more, or nearly so; allow more, or shrink the photographs with --max-side."
+            )
+    return BlockRequest(count=None if options.blocks == "auto" else options.blocks, most_gaussians=most)

@@ -1,0 +1,105 @@
+"""``octasplat plan``: blocks, time and memory from the sparse points, before anything starts."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+from click.testing import CliRunner
+
+from octasplat.__main__ import cli
+from octasplat.engine.blocks.sparse_plan import draw_map, plan_from_points
+from octasplat.engine.core.byte_sizes import parse_bytes
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.dataset import load_dataset_model
+from octasplat.engine.dataset.image_sizes import ImageSizes
+from octasplat.engine.operations.cost_model import estimate_reconstruction, gaussians_within
+from octasplat.engine.operations.plan import PlanRequest, run
+from octasplat.engine.pipeline import BlockRequest
+from octasplat.engine.runs.config import resolve_config
+from tests.support.tiny_dataset import make_tiny_dataset
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_tiny_dataset(tmp_path_factory, views=12, width_px=96, height_px=64)
+
+
+def test_plan_of_two_blocks_covers_the_photographs(scene: Path, tmp_path: Path) -> None:
+    picture = tmp_path / "map.png"
+    found = run(PlanRequest(source=scene, blocks=2, cores=2, picture=picture))
+    assert len(found.blocks) == 2 and found.photographs == 10 and found.cores == 2
+    assert all(0 < block.pixels <= 10 * 96 * 64 and 0 < block.photographs <= 10 for block in found.blocks)
+    assert sum(block.pixels for block in found.blocks) >= 10 * 96 * 64
+    assert found.seconds > sum(block.seconds for block in found.blocks) > 0
+    assert found.files == (picture,)
+    colors = np.unique(oiio.ImageBuf(str(picture)).get_pixels(oiio.UINT8).reshape(-1, 3), axis=0)
+    assert len(colors) == 4  # two blocks, cameras, nothing
+    assert found.lines()[0].startswith("2 blocks of 10 photographs: about ")
+
+
+def test_small_scene_stays_one_block_at_the_cost_of_an_ordinary_run(scene: Path) -> None:
+    found = run(PlanRequest(source=scene, cores=1))
+    config = resolve_config("standard").with_poses_decided(True)
+    ordinary = estimate_reconstruction(config, [ImageSizes(96, 64, 12)], 1)
+    assert len(found.blocks) == 1 and found.seconds == ordinary.seconds
+    assert found.memory_bytes == ordinary.memory_bytes
+    assert found.lines()[0].startswith("One block, an ordinary run, of 10 photographs")
+
+
+def test_shares_of_blocks_add_up_to_the_whole_and_their_margins(scene: Path) -> None:
+    model = load_dataset_model(scene)
+    blocks = plan_from_points(model, np.arange(12), 4)
+    assert 1 <= sum(block.share for block in blocks) < 2
+    assert draw_map(model, [block.core for block in blocks]).shape[2] == 3
+
+
+def test_number_of_blocks_grows_with_photographs_and_with_gaussians_that_do_not_fit() -> None:
+    config = resolve_config("standard", assignments=["max_gaussians=1000000"]).train
+    assert [BlockRequest().fewest(config, views, 10**9) for views in (10, 500, 501, 2000)] == [1, 1, 2, 4]
+    assert BlockRequest(most_gaussians=1_000_000).fewest(config, 100, 10**9) == 1
+    assert BlockRequest(most_gaussians=300_000).fewest(config, 100, 10**9) == 4
+
+
+def test_gaussians_within_memory_are_those_of_its_estimate() -> None:
+    sizes = [ImageSizes(800, 600, 100)]
+    for memory_bytes in (1_000_000_000, 4_000_000_000):
+        config = resolve_config("standard")
+        most = gaussians_within(config, sizes, memory_bytes)
+        train = config.train.model_copy(update={"max_gaussians": most})
+        found = estimate_reconstruction(config.model_copy(update={"train": train}), sizes, 1)
+        assert found.memory_bytes == pytest.approx(memory_bytes, rel=0.01)
+    assert gaussians_within(resolve_config("standard"), sizes, 100_000_000) == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "size"), [("8G", 8 * 10**9), ("1.5 gb", 1_500_000_000), ("500M", 500_000_000), ("77", 77)]
+)
+def test_sizes_of_memory(text: str, size: int) -> None:
+    assert parse_bytes(text) == size
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"memory": "8G"}, "--blocks auto"),
+        ({"memory": "much", "blocks": "auto"}, "no size of memory"),
+        ({"memory": "10M", "blocks": "auto"}, "holds no block"),
+        ({"blocks": 2, "materials": True}, "materials"),
+        ({"blocks": 5000}, "fewer blocks"),
+    ],
+)
+def test_what_cannot_be_planned_is_refused_in_a_sentence(
+    scene: Path, options: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(ConfigError, match=sentence):
+        run(PlanRequest(source=scene, **options))
+
+
+def test_command_prints_the_plan(scene: Path) -> None:
+    done = CliRunner().invoke(cli, ["plan", str(scene), "--blocks", "3", "--cores", "4"])
+    assert done.exit_code == 0 and "3 blocks of 10 photographs" in done.stdout
+    assert "block 3:" in done.stdout
+    refused = CliRunner().invoke(cli, ["plan", str(scene), "--blocks", "none"])
+    assert refused.exit_code != 0 and "--blocks" in refused.stderr
