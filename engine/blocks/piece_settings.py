@@ -10,6 +10,8 @@ COARSE_ITERATIONS, COARSE_GAUSSIANS = 2_500, 50_000
 COARSE_ITERATION_FRACTION, COARSE_GAUSSIAN_FRACTION = 1 / 2, 1 / 4
 """Most of it where the run says how many: of the iterations of a block, and of all Gaussians, as photographs
 of half the size have a quarter of the pixels."""
+MIN_COARSE_GAUSSIANS = 4_000
+"""Which are soon trained; fewer where the whole scene has fewer."""
 MIN_COARSE_SIDE_PX = 200
 POLISH_FRACTION = 0.1
 """Iterations of the polish, of those that an ordinary training of its pixels takes."""
@@ -43,6 +45,7 @@ def coarse_settings(config: TrainConfig) -> TrainConfig:
     """Return the settings of the coarse scene."""
     iterations = math.ceil(COARSE_ITERATION_FRACTION * config.iterations) or COARSE_ITERATIONS
     most_gaussians = math.ceil(COARSE_GAUSSIAN_FRACTION * config.max_gaussians)  # 0 asks the pixels
+    most_gaussians = max(most_gaussians, min(MIN_COARSE_GAUSSIANS, config.max_gaussians))
     return config.model_copy(
         update={
             "iterations": min(iterations, COARSE_ITERATIONS),

@@ -93,7 +93,9 @@ class PlanResult(Result):
             f"about {format_duration(block.seconds)}"
             for number, block in enumerate(self.blocks, start=1)
         ]
-        return (f"{count} blocks of {self.photographs} photographs: {total}", *blocks, *super().lines())
+        rest = f"  coarse scene and polish: about {format_duration(self.coarse_seconds)}"
+        first = f"{count} blocks of {self.photographs} photographs: {total}"
+        return (first, *blocks, rest, *super().lines())
 
 
 def run(
