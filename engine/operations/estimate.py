@@ -1,6 +1,5 @@
 """``estimate``: the cost of a reconstruction, before it starts."""
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,6 +10,7 @@ from octasplat.engine.core.events import EventListener, Warned, ignore_events
 from octasplat.engine.core.threads import available_threads
 from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.base import Operation, Request, Result, never_stop
+from octasplat.engine.operations.photograph_sizes import photograph_sizes
 from octasplat.engine.operations.reconstruct import ReconstructOptions
 from octasplat.engine.settings.fields import Positional, ReadPath, Spelling, Unit
 
@@ -130,22 +130,6 @@ def estimate_photographs(
 
     found = estimate_reconstruction(config, sizes, cores or available_threads())
     return found.with_cold_start(cold_start_seconds(["reconstruct"]))
-
-
-def photograph_sizes(scene: Path) -> list[ImageSizes]:
-    """Return the sizes of the photographs in a folder, read from their headers.
-
-    Raises:
-        DatasetError: there are none, or one cannot be read.
-    """
-    from octasplat.engine.dataset.images import read_image_info
-    from octasplat.engine.dataset.photograph_files import image_folder
-    from octasplat.engine.poses.photographs import photographs_of_scene
-
-    names = photographs_of_scene(scene)
-    infos = [read_image_info(image_folder(scene) / name) for name in names]
-    counts = Counter((info.width_px, info.height_px) for info in infos)
-    return [ImageSizes(width, height, count) for (width, height), count in counts.items()]
 
 
 OPERATION = Operation(

@@ -12,7 +12,8 @@ from octasplat.engine.core.events import EventListener, ignore_events
 from octasplat.engine.core.threads import available_threads
 from octasplat.engine.operations.base import Operation, Result, WritingRequest, never_stop
 from octasplat.engine.operations.block_options import BlockOptions, block_request
-from octasplat.engine.operations.estimate import EstimateOptions, photograph_sizes
+from octasplat.engine.operations.estimate import EstimateOptions
+from octasplat.engine.operations.photograph_sizes import photograph_sizes
 from octasplat.engine.settings.fields import Positional, ReadPath, Spelling
 
 if TYPE_CHECKING:

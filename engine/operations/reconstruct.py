@@ -10,6 +10,7 @@ from pydantic import Field, ValidationError
 from octasplat.engine.core.events import EventListener, ignore_events
 from octasplat.engine.operations.base import Operation, Options, Output, Request, Result, never_stop
 from octasplat.engine.operations.block_options import BlockOptions, block_request
+from octasplat.engine.operations.photograph_sizes import photograph_sizes
 from octasplat.engine.runs.run_settings import RunSettings
 from octasplat.engine.settings import renamed_settings
 from octasplat.engine.settings.fields import (
@@ -292,8 +293,6 @@ def run(
         _take_frames(request, scene, stop_when_asked(progress, should_stop))
     located, blocks = locate_scene(scene), None
     if request.blocks is not None or request.memory is not None:
-        from octasplat.engine.operations.estimate import photograph_sizes
-
         sizes = photograph_sizes(located) if request.memory is not None else []
         blocks = block_request(request, config, sizes)
     reconstruct(

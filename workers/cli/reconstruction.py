@@ -54,7 +54,8 @@ def run_reconstruction(
 
 def _estimate_sentence(request: ReconstructRequest, threads: int, is_resumed: bool) -> str | None:
     """Return what a new run is to take; None where it goes on from where it is or nobody can tell."""
-    from octasplat.engine.operations.estimate import estimate_scene, photograph_sizes
+    from octasplat.engine.operations.estimate import estimate_scene
+    from octasplat.engine.operations.photograph_sizes import photograph_sizes
     from octasplat.engine.poses.photographs import locate_scene
 
     if is_resumed:
