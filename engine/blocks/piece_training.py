@@ -58,7 +58,7 @@ class Piece:
         data: what it is trained on.
         config: settings of it.
         start: makes the state before its first iteration.
-        surroundings: Gaussians that are seen, too, and stay as they are.
+        fixed_gaussians: Gaussians that are seen, too, and stay as they are.
         keeps_near_free: whether no Gaussian stays near to a camera.
     """
 
@@ -66,7 +66,7 @@ class Piece:
     data: TrainingData
     config: TrainConfig
     start: Callable[[], TrainState]
-    surroundings: FlatGaussians | None = None
+    fixed_gaussians: FlatGaussians | None = None
     keeps_near_free: bool = True
 
 
@@ -120,7 +120,7 @@ def train_piece(work: BlockWork, piece: Piece, progress: EventListener) -> BestS
         should_stop=work.should_stop,
         min_scale=MinScale.of_views(viewpoints, trained, config.min_scale_px),
         camera_clearance=zones,
-        surroundings=piece.surroundings,
+        fixed_gaussians=piece.fixed_gaussians,
     )
     gaussians = trainer.run()
     record = {

@@ -15,8 +15,8 @@ from octasplat.engine.gaussians.morton import morton_order
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.shading.recipes import material_shading
 from octasplat.engine.trace.factory import make_tracer
+from octasplat.engine.trace.fixed_gaussians import PartlyFixedTracer
 from octasplat.engine.trace.protocol import Tracer
-from octasplat.engine.trace.surroundings import SurroundedTracer
 from octasplat.engine.train.config import TrainConfig, iteration_count, max_gaussian_count
 from octasplat.engine.train.densify import make_densifier
 from octasplat.engine.train.densify.normal_propagation import NormalPropagation
@@ -56,7 +56,7 @@ class Trainer:
         min_scale: least size of Gaussians.
         camera_clearance: zones around cameras in which no Gaussian stays, whatever the strategy does.
         view_frusta: frusta of the views; no Gaussian stays outside of all of them.
-        surroundings: Gaussians that are seen, too, and stay as they are; not with a tracer that is given.
+        fixed_gaussians: Gaussians that are seen, too, and stay as they are; not with a tracer that is given.
         tracer: anything that follows the protocol; None takes the one that the configuration names.
         shading: anything that follows the protocol; None takes the one that the configuration asks for.
         on_step: called after each iteration with the number of those done and the tracer as it is then; it
@@ -87,13 +87,13 @@ class Trainer:
         min_scale: MinScale | None = None,
         camera_clearance: CameraClearance | None = None,
         view_frusta: ViewFrusta | None = None,
-        surroundings: FlatGaussians | None = None,
+        fixed_gaussians: FlatGaussians | None = None,
         tracer: Tracer | None = None,
         shading: ShadingModel | None = None,
         on_step: Callable[[int, Tracer], None] | None = None,
     ) -> None:
         self.state = state
-        self._surroundings = surroundings
+        self._fixed_gaussians = fixed_gaussians
         self._on_step = on_step
         self._min_scale = min_scale
         self._allowed_region = AllowedRegion(camera_clearance, view_frusta)
@@ -245,7 +245,7 @@ class Trainer:
         sort = "packet" if self.schedule.uses_shared_sort(self.state.iteration) else "ray"
         settings = self._config.trace.model_copy(update={"sort": sort})
         tracer = make_tracer(settings, threads=self._threads, box_padding=self._config.box_padding)
-        return tracer if self._surroundings is None else SurroundedTracer(tracer, self._surroundings)
+        return tracer if self._fixed_gaussians is None else PartlyFixedTracer(tracer, self._fixed_gaussians)
 
     def _rebuild_bvh(self) -> None:
         """Rebuild the BVH over the current Gaussians, replacing the tracer when the sort mode changes."""

@@ -4,15 +4,15 @@ import numpy as np
 
 from octasplat.engine.gaussians.model import concatenate
 from octasplat.engine.trace.factory import make_tracer
+from octasplat.engine.trace.fixed_gaussians import PartlyFixedTracer
 from octasplat.engine.trace.protocol import TraceGradients, TraceSettings
-from octasplat.engine.trace.surroundings import SurroundedTracer
 from tests.support.trace_scenes import PARAMETERS, make_cloud, rays_inwards
 
 
 def test_fixed_gaussians_are_seen_and_get_no_gradients() -> None:
     rng = np.random.default_rng(5)
     own, around = make_cloud(rng, 40, degree=1), make_cloud(rng, 70, degree=2)
-    tracer = SurroundedTracer(make_tracer(TraceSettings(), threads=1), around)
+    tracer = PartlyFixedTracer(make_tracer(TraceSettings(), threads=1), around)
     tracer.build(own)
     own.means_world += np.float32(0.02)
     own.sh *= np.float32(0.5)

@@ -13,7 +13,7 @@ from octasplat.engine.gaussians.rows import select_rows
 from octasplat.engine.trace.protocol import GaussianGradients, Recording, TraceGradients, Tracer, TraceResult
 
 
-class SurroundedTracer:
+class PartlyFixedTracer:
     """Trace Gaussians and fixed ones around them as one scene; only the former get gradients.
 
     Follows :class:`octasplat.engine.trace.protocol.Tracer`. The fixed ones come after the others, have no
@@ -21,12 +21,12 @@ class SurroundedTracer:
 
     Args:
         tracer: traces all of them.
-        surroundings: the fixed Gaussians.
+        fixed_gaussians: the fixed Gaussians.
     """
 
-    def __init__(self, tracer: Tracer, surroundings: FlatGaussians) -> None:
+    def __init__(self, tracer: Tracer, fixed_gaussians: FlatGaussians) -> None:
         self._tracer = tracer
-        self._surroundings = replace(surroundings, channels=Channels())
+        self._fixed_gaussians = replace(fixed_gaussians, channels=Channels())
         self.settings = tracer.settings
         self._gaussians: FlatGaussians | None = None
         self._features: Float32[np.ndarray, "n f"] | None = None
@@ -35,7 +35,7 @@ class SurroundedTracer:
 
     def build(self, gaussians: FlatGaussians, features: Float32[np.ndarray, "n f"] | None = None) -> None:
         """Build the hierarchy of the Gaussians and those around them."""
-        around = with_sh_degree(self._surroundings, gaussians.sh_degree)
+        around = with_sh_degree(self._fixed_gaussians, gaussians.sh_degree)
         self._gaussians, self._features = gaussians, features
         self._all = concatenate([replace(gaussians, channels=Channels()), around])
         self._all_features = None
