@@ -20,6 +20,8 @@ from octasplat.engine.train.shading_factory import find_background, find_deferre
 
 MAX_SIDE_PX = 320
 MIN_SIDE_PX = 96
+MATERIALS_SIDE_PX = 160
+"""Materials send rays of their own, which take memory beside that of the training."""
 PREVIEW_FILE = ".preview.png"
 INTERVAL_SECONDS = 12.0
 FIRST_INTERVAL_SECONDS = 4.0
@@ -65,9 +67,11 @@ class PreviewRenderer:
             return
         # A view that is held out shows how the scene looks where nothing was fitted.
         chosen = int((dataset.test_indices if len(dataset.test_indices) else dataset.train_indices)[0])
-        rays = grid_rays(dataset, chosen, self._side_px)
+        materials = find_deferred(shading)
         # The background shades the materials before it, too.
-        shown = find_background(shading) or find_deferred(shading) or PLAIN_SHADING
+        shown = find_background(shading) or materials or PLAIN_SHADING
+        side_px = self._side_px if materials is None else min(self._side_px, MATERIALS_SIDE_PX)
+        rays = grid_rays(dataset, chosen, side_px)
         image = render_rays(tracer, rays, self._background, shown)
         write_png(self._run / PREVIEW_FILE, image.rgb_srgb)
         self._listener(PreviewWritten(PREVIEW_FILE, iteration, dataset.views[chosen].name))
@@ -77,7 +81,7 @@ class PreviewRenderer:
         self._next_at = began + max(wait, 2 * spent)
         if spent > 0:
             # The time is that of the pixels, so that it grows with the square of the side.
-            fitting_px = self._side_px * math.sqrt(MAX_TIME_FRACTION * INTERVAL_SECONDS / spent)
+            fitting_px = side_px * math.sqrt(MAX_TIME_FRACTION * INTERVAL_SECONDS / spent)
             self._side_px = int(min(MAX_SIDE_PX, max(MIN_SIDE_PX, fitting_px)))
 
 
