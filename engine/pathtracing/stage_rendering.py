@@ -15,7 +15,7 @@ from octasplat.engine.pathtracing.film import StageImage
 from octasplat.engine.pathtracing.gaussian_layers import GaussianLayers, build_gaussian_layers
 from octasplat.engine.pathtracing.path_tracer import PathTracer, PathTracerScene
 from octasplat.engine.pathtracing.stage.model import Integrator, Stage
-from octasplat.engine.pathtracing.stage.motion import is_moving, stage_at
+from octasplat.engine.pathtracing.stage_motion import is_moving, stage_at
 from octasplat.engine.pathtracing.stage_origin import places_note, stage_about
 from octasplat.engine.pathtracing.stage_placement import place_resting_meshes
 from octasplat.engine.pathtracing.stage_scene import SIZE_PER_RADIUS, StageScene

@@ -8,8 +8,8 @@ from click.testing import CliRunner, Result
 from octasplat.engine.core.errors import OctasplatError
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.engine.pathtracing.stage.model import Stage
-from octasplat.engine.pathtracing.stage.motion import stage_at
 from octasplat.engine.pathtracing.stage.stage_file import read_stage
+from octasplat.engine.pathtracing.stage_motion import stage_at
 from octasplat.workers.cli.main import cli
 from tests.support.light_scenes import table_with_a_box
 

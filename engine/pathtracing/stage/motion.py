@@ -1,20 +1,13 @@
-"""Keys of things and lamps that move in a film, and the stage of one image of it.
-
-Between two keys what they give changes evenly; before the first and after the last it rests. Imports neither
-torch nor numba.
-"""
+"""Keys of things and lamps that move in a film. Imports neither torch nor numba."""
 
 import math
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import Annotated, TypeVar
 
 from pydantic import Field, model_validator
 
 from octasplat.engine.pathtracing.stage.base import Finite, StageModel, Vector
-
-if TYPE_CHECKING:
-    from octasplat.engine.pathtracing.stage.model import Stage
 
 MAX_KEYS = 1000
 _LEAST_SUM = 1e-3
@@ -72,7 +65,6 @@ class LightKey(MotionKey):
         return self
 
 
-MovingT = TypeVar("MovingT", bound=StageModel)
 KeyT = TypeVar("KeyT", bound=MotionKey)
 Keys = Annotated[tuple[KeyT, ...], Field(max_length=MAX_KEYS)]
 
@@ -91,55 +83,14 @@ def check_keys(keys: Sequence[MotionKey], movable: Sequence[str]) -> None:
         raise ValueError("the frames of the keys must rise from key to key")
     for name in {name for key in keys for name in key.moved} - set(movable):
         raise ValueError(f"keys give `{name}`, which this kind does not have")
-    directions = [_unit(key.direction) for key in keys if isinstance(key, LightKey) and key.direction]
+    directions = [
+        unit_direction(key.direction) for key in keys if isinstance(key, LightKey) and key.direction
+    ]
     if any(math.dist(one, [-value for value in other]) < _LEAST_SUM for one, other in pairwise(directions)):
         raise ValueError("the direction turns half round between two keys; put a key between them")
 
 
-def is_moving(stage: "Stage") -> bool:
-    """Return whether anything in a stage has keys."""
-    return any(part.keys for part in (*stage.meshes, *stage.lights))
-
-
-def stage_at(stage: "Stage", frame: int) -> "Stage":
-    """Return the stage of one image, in which nothing has keys any more.
-
-    Args:
-        stage: with or without keys.
-        frame: number of the image, from 0.
-    """
-    return stage.model_copy(
-        update={
-            "meshes": tuple(_placed_at(mesh, mesh.keys, frame) for mesh in stage.meshes),
-            "lights": tuple(_placed_at(light, light.keys, frame) for light in stage.lights),
-        }
-    )
-
-
-def _placed_at(part: MovingT, keys: Sequence[MotionKey], frame: int) -> MovingT:
-    changes: dict[str, Any] = {"keys": ()}
-    for name in ("position", "direction", "turn_degrees"):
-        given = [(key.frame, getattr(key, name)) for key in keys if name in key.moved]
-        if not given:
-            continue
-        if name == "turn_degrees":
-            changes[name] = _between([(number, (value,)) for number, value in given], frame)[0]
-        else:
-            even = _unit if name == "direction" else tuple
-            changes[name] = _between([(number, even(value)) for number, value in given], frame)
-    return part.model_copy(update=changes)
-
-
-def _between(given: Sequence[tuple[int, tuple[float, ...]]], frame: int) -> tuple[float, ...]:
-    """Return what lies between the values before and after a frame; those of the ends beyond them."""
-    before = max((each for each in given if each[0] <= frame), default=given[0])
-    after = min((each for each in given if each[0] >= frame), default=given[-1])
-    if before[0] >= after[0]:
-        return before[1] if frame >= before[0] else after[1]
-    share = (frame - before[0]) / (after[0] - before[0])
-    return tuple(a + share * (b - a) for a, b in zip(before[1], after[1], strict=True))
-
-
-def _unit(direction: Sequence[float]) -> tuple[float, ...]:
+def unit_direction(direction: Sequence[float]) -> tuple[float, ...]:
+    """Return a direction at length 1."""
     length = math.hypot(*direction)
     return tuple(value / length for value in direction)
