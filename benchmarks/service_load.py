@@ -16,6 +16,7 @@ import os
 import statistics
 import tempfile
 import time
+import uuid
 from pathlib import Path
 from typing import Any
 
@@ -44,14 +45,21 @@ class Load:
         self.events = 0
         self.ended = 0
         self.put_off = 0
-        """How often an answer asked for patience."""
+        """How often an answer asked for patience, or did not come."""
 
     async def ask(self, method: str, path: str, **arguments: Any) -> Any:
         """The JSON of an answer; one that asks for patience is asked for again when it says."""
+        if method == "POST":  # a connection may end before its answer has come
+            arguments["headers"] = {"Idempotency-Key": str(uuid.uuid4())}
         async with self._turn:
             while True:
                 began = time.perf_counter()
-                response = await self._http.request(method, path, **arguments)
+                try:
+                    response = await self._http.request(method, path, **arguments)
+                except httpx.TransportError:
+                    self.put_off += 1
+                    await asyncio.sleep(1)
+                    continue
                 self.milliseconds.append(1000 * (time.perf_counter() - began))
                 if response.status_code not in (429, 503):
                     break
