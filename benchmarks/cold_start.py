@@ -20,7 +20,7 @@ from pathlib import Path
 from octasplat.engine.core.kernel_folder import CACHE_VARIABLE
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 
-RUN = ("--iterations", "300", "--rays", "4096", "--max-gaussians", "10000")
+RUN = ("--iterations", "300", "--rays-per-batch", "4096", "--max-gaussians", "10000")
 COMMANDS: dict[str, tuple[str, ...]] = {
     "reconstruct": ("reconstruct", "{scene}", "-o", "{out}", *RUN),
     "reconstruct --materials": ("reconstruct", "{scene}", "-o", "{out}", "--materials", *RUN),
@@ -58,8 +58,10 @@ def run_command(words: tuple[str, ...], places: dict[str, Path], cache: Path) ->
 def main() -> None:
     """Measure the commands that are named, or all of them."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("names", nargs="*", choices=[*COMMANDS, []])
+    parser.add_argument("names", nargs="*", metavar="COMMAND", help=f"of {', '.join(COMMANDS)}")
     names = parser.parse_args().names or list(COMMANDS)
+    if unknown := set(names) - set(COMMANDS):
+        parser.error(f"there is no {' and no '.join(sorted(unknown))} here")
     with tempfile.TemporaryDirectory(prefix="octasplat-cold-") as folder:
         root = Path(folder)
         scene, shared = root / "scene", root / "cache"

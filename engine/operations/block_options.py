@@ -3,9 +3,8 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import Field
+from pydantic import ByteSize, Field, TypeAdapter, ValidationError
 
-from octasplat.engine.core.byte_sizes import parse_bytes
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.base import Options
@@ -56,10 +55,22 @@ def block_request(
         return None
     most = None
     if options.memory is not None:
-        most = gaussians_within(config, sizes, parse_bytes(options.memory))
+        most = gaussians_within(config, sizes, parse_memory(options.memory))
         if most < MIN_GAUSSIANS:
             raise ConfigError(
                 f"--memory {options.memory} holds no block: what a training takes besides its Gaussians is "
                 "more, or nearly so; allow more, or shrink the photographs with --max-side."
             )
     return BlockRequest(count=None if options.blocks == "auto" else options.blocks, most_gaussians=most)
+
+
+def parse_memory(text: str) -> int:
+    """Return the bytes that ``8G``, ``500M``, ``2GiB`` or a plain number mean; G is 10^9.
+
+    Raises:
+        ConfigError: it is no size.
+    """
+    try:
+        return int(TypeAdapter(ByteSize).validate_python(text))
+    except ValidationError:
+        raise ConfigError(f"'{text}' is no size of memory; write it as 8G or 500M.") from None

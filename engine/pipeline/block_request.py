@@ -16,7 +16,7 @@ from octasplat.engine.train.config import TrainConfig, max_gaussian_count
 from octasplat.engine.train.sampling.pixel_sampler import valid_pixel_fraction
 
 AUTO_VIEWS = 500
-"""Training views for each of which so many a scene gets a block more, where their number is automatic."""
+"""Most training views of each block, on average, where the number of blocks is automatic."""
 REQUEST = "request.json"
 
 

@@ -10,10 +10,10 @@ from click.testing import CliRunner
 
 from octasplat.__main__ import cli
 from octasplat.engine.blocks.sparse_plan import draw_map, plan_from_points
-from octasplat.engine.core.byte_sizes import parse_bytes
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.dataset import load_dataset_model
 from octasplat.engine.dataset.image_sizes import ImageSizes
+from octasplat.engine.operations.block_options import parse_memory
 from octasplat.engine.operations.cost_model import estimate_reconstruction, gaussians_within
 from octasplat.engine.operations.plan import PlanRequest, run
 from octasplat.engine.pipeline import BlockRequest
@@ -77,7 +77,7 @@ def test_gaussians_within_memory_are_those_of_its_estimate() -> None:
     ("text", "size"), [("8G", 8 * 10**9), ("1.5 gb", 1_500_000_000), ("500M", 500_000_000), ("77", 77)]
 )
 def test_sizes_of_memory(text: str, size: int) -> None:
-    assert parse_bytes(text) == size
+    assert parse_memory(text) == size
 
 
 @pytest.mark.parametrize(
