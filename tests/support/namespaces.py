@@ -2,12 +2,15 @@
 
 import asyncio
 import contextlib
+import fcntl
 import os
 import shutil
 import subprocess
+import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 BRIDGE = "octabr0"
 GATEWAY = "10.213.77.1"
@@ -19,9 +22,13 @@ def missing_requirement() -> str | None:
         return "network namespaces need root"
     if shutil.which("ip") is None:
         return "network namespaces need the program ip (iproute2)"
-    if _ip("netns", "add", "octaprobe", check=False) != 0:
+    probe = f"octa{os.getpid()}"
+    if _ip("netns", "add", probe, check=False) != 0:
         return "network namespaces cannot be made here"
-    _ip("netns", "del", "octaprobe")
+    _ip("netns", "del", probe)
+    if _ip("link", "add", probe, "type", "bridge", check=False) != 0:
+        return "network bridges cannot be made here"
+    _ip("link", "del", probe)
     return None
 
 
@@ -47,9 +54,15 @@ class NamespaceHost:
 
 @contextlib.contextmanager
 def hosts(count: int) -> Iterator[list[NamespaceHost]]:
-    """Namespaces that reach this one at :data:`GATEWAY` and see neither its network nor its loopback."""
+    """Namespaces that reach this one at :data:`GATEWAY` and see neither its network nor its loopback.
+
+    There is one such bridge at a time; other tests that ask for one wait.
+    """
     made = [NamespaceHost(f"octahost{number}", f"octa{number}") for number in range(count)]
+    lock = (Path(tempfile.gettempdir()) / "octasplat-tests-bridge.lock").open("w")
+    fcntl.flock(lock, fcntl.LOCK_EX)
     try:
+        _remove_all(made)  # of a test that was killed
         _ip("link", "add", BRIDGE, "type", "bridge")
         _ip("addr", "add", f"{GATEWAY}/24", "dev", BRIDGE)
         _ip("link", "set", BRIDGE, "up")
@@ -63,10 +76,15 @@ def hosts(count: int) -> Iterator[list[NamespaceHost]]:
             _ip(*inside, "link", "set", "eth0", "up")
         yield made
     finally:
-        for host in made:
-            _ip("link", "del", host.cable, check=False)
-            _ip("netns", "del", host.name, check=False)
-        _ip("link", "del", BRIDGE, check=False)
+        _remove_all(made)
+        lock.close()
+
+
+def _remove_all(hosts: Sequence[NamespaceHost]) -> None:
+    for host in hosts:
+        _ip("link", "del", host.cable, check=False)
+        _ip("netns", "del", host.name, check=False)
+    _ip("link", "del", BRIDGE, check=False)
 
 
 @contextlib.contextmanager

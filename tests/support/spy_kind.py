@@ -37,6 +37,8 @@ def run(task: Task) -> None:
         "network": lambda: _connect(("127.0.0.1", 9)),
         "socket": lambda: socket.socket(socket.AF_UNIX).close(),
         "store": lambda: (store / "planted").write_text("x"),
+        "niceness": lambda: os.getpriority(os.PRIO_PROCESS, 0),
+        "niceness among sessions": lambda: Path("/proc/self/autogroup").read_text().split()[-1],
         "work of others": lambda: (task.folder.parent / "planted").write_text("x"),
         **{f"file {path}": lambda path=path: Path(path).read_text() for path in options.secrets},
     }

@@ -11,6 +11,7 @@ import pytest
 
 from octasplat.workers.client.api import Api
 from octasplat.workers.sandbox.capabilities import sandbox_capabilities
+from octasplat.workers.worker.job_process import NICENESS
 from tests.support.worker_harness import ROOT, WorkerHarness, wait_for_end
 
 pytestmark = pytest.mark.skipif(
@@ -48,7 +49,7 @@ main()
 """
 
 
-def test_sandboxed_job_sees_no_secrets(bench: WorkerHarness) -> None:
+def test_sandboxed_job_sees_no_secrets_and_yields_the_cpu(bench: WorkerHarness) -> None:
     secrets = [bench.folder / "store" / "blob", bench.folder / "data" / "token"]
     for path in secrets:
         path.parent.mkdir()
@@ -58,6 +59,10 @@ def test_sandboxed_job_sees_no_secrets(bench: WorkerHarness) -> None:
     assert bench.wait_until_finished(job_id).state == "succeeded", bench.log(job_id)
     found = json.loads(bench.results(job_id)["found.json"])
     assert found.pop("own environment") == []
+    assert found.pop("niceness") == NICENESS
+    assert found.pop("niceness among sessions") == (
+        str(NICENESS) if Path("/proc/self/autogroup").is_file() else "FileNotFoundError"
+    )
     assert {name: got for name, got in found.items() if got != "PermissionError"} == {}
     assert not list(bench.folder.rglob("planted"))
 

@@ -34,8 +34,8 @@ OUTLIER_MARGIN_DB, OUTLIER_SIGMAS = 3.0, 5.0
 """A view that is so much worse than those around it, also in robust standard deviations, is misplaced."""
 MAX_EXCLUDED_FRACTION = 0.25
 """No larger share of the training views is left out."""
-MISPLACED_SIGMAS = 3.0
-"""Robust standard deviations after a short training: fewer, as matches have the last word on poses."""
+MISPLACED_MARGIN_DB, MISPLACED_SIGMAS = 2.0, 3.0
+"""The same after a short training: less, as matches have the last word on poses."""
 MAX_MISPLACED_VIEWS, MAX_MISPLACED_FRACTION = 20, 0.25
 """No more views are in doubt, nor a larger share of all; the worst are."""
 
@@ -80,6 +80,7 @@ def find_outlier_views(
     measured: ViewPsnr,
     views: Sequence[DatasetView],
     train_indices: Int64[np.ndarray, " t"],
+    margin_db: float = OUTLIER_MARGIN_DB,
     sigmas: float = OUTLIER_SIGMAS,
 ) -> Int64[np.ndarray, " m"]:
     """Return the views that are rendered far worse than the training views around them, worst first.
@@ -92,6 +93,7 @@ def find_outlier_views(
         measured: of views, training views among them.
         views: all views of the dataset.
         train_indices: views that are trained on.
+        margin_db: how much worse at least.
         sigmas: how many robust standard deviations are far.
     """
     known = np.isfinite(measured.psnr_colour_corrected)
@@ -110,7 +112,7 @@ def find_outlier_views(
         if not trained.all():
             # held-out views are worse as a rule: only the excess counts
             below[~trained] -= max(0.0, float(np.median(below[~trained])))
-        low = below > max(OUTLIER_MARGIN_DB, sigmas * sigma)
+        low = below > max(margin_db, sigmas * sigma)
     worst_first = np.argsort(-below, kind="stable")
     return indices[worst_first[low[worst_first]]]
 
@@ -130,7 +132,13 @@ def find_misplaced_views(
         shading: of that training.
     """
     measured = measure_views(dataset, np.arange(len(dataset.views)), background_srgb, tracer, shading)
-    doubtful = find_outlier_views(measured, dataset.views, dataset.train_indices, MISPLACED_SIGMAS)
+    doubtful = find_outlier_views(
+        measured,
+        dataset.views,
+        dataset.train_indices,
+        margin_db=MISPLACED_MARGIN_DB,
+        sigmas=MISPLACED_SIGMAS,
+    )
     max_count = min(MAX_MISPLACED_VIEWS, int(MAX_MISPLACED_FRACTION * len(dataset.views)))
     return np.sort(doubtful[:max_count])
 
