@@ -11,7 +11,7 @@ import pytest
 
 from octasplat.workers.client.api import Api
 from octasplat.workers.sandbox.capabilities import sandbox_capabilities
-from octasplat.workers.worker.job_process import NICENESS
+from octasplat.workers.worker.child_main import NICENESS
 from tests.support.worker_harness import ROOT, WorkerHarness, wait_for_end
 
 pytestmark = pytest.mark.skipif(

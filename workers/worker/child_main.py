@@ -14,6 +14,7 @@ import os
 import signal
 import sys
 import time
+from pathlib import Path
 from typing import NoReturn
 
 from octasplat.workers.parent_death_signal import set_parent_death_signal
@@ -23,6 +24,8 @@ from octasplat.workers.sandbox.process_tree import kill_descendants
 
 END_SIGNAL = signal.SIGUSR1
 """Not SIGTERM, which systemd sends to all processes of a service that is to stop by itself."""
+NICENESS = 10
+"""Of a job, so that a front end and a database on the same host answer while all cores are at work."""
 _HANDLED = {signal.SIGCHLD, signal.SIGTERM, signal.SIGINT, END_SIGNAL}
 _EAGER_ROUNDS = 2_000
 """At first without pauses, as some may start others as fast as they are killed."""
@@ -31,6 +34,7 @@ _PAUSE_SECONDS = 0.01
 
 def main() -> NoReturn:
     """Run the job's process and end as it ends."""
+    _lower_priority()
     # Blocked before the fork, so that sigwait loses none that arrives early.
     signal.pthread_sigmask(signal.SIG_BLOCK, _HANDLED)
     # Elsewhere than on Linux the program sees the end of its stdin.
@@ -59,6 +63,14 @@ def main() -> NoReturn:
     if os.WIFSIGNALED(status):
         _end_by_signal(os.WTERMSIG(status))
     os._exit(os.waitstatus_to_exitcode(status))
+
+
+def _lower_priority() -> None:
+    """Lower the CPU priority of this session."""
+    os.nice(max(0, NICENESS - os.nice(0)))
+    # Between sessions Linux compares the niceness of these groups alone, where it makes them.
+    with contextlib.suppress(OSError):
+        Path("/proc/self/autogroup").write_text(str(os.nice(0)), encoding="ascii")
 
 
 def _wait_for_program(program: int) -> int | None:

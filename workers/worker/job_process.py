@@ -28,8 +28,6 @@ from octasplat.workers.storage.os_errors import is_disk_full
 from octasplat.workers.worker.task import EXIT_REFUSED, EXIT_STOPPED, EXIT_UNEXPECTED, NO_SPACE_ERROR, Task
 
 OOM_SCORE_ADJUSTMENT = 800
-NICENESS = 10
-"""Of a job, so that a front end and a database on the same host answer while all cores are at work."""
 MAX_CAUSE_LINES = 60
 
 
@@ -56,7 +54,6 @@ def run_job() -> NoReturn:
     lines = _EventStream()
     given: dict[str, Any] = json.loads(sys.stdin.readline())
     _raise_oom_score()
-    _lower_priority()
     _enter_sandbox(given)
     stop = threading.Event()
     threading.Thread(target=_watch_stdin, args=(stop,), daemon=True).start()
@@ -138,14 +135,6 @@ def _raise_oom_score() -> None:
     """Raise the OOM score, so that the system kills this process before the database."""
     with contextlib.suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text(str(OOM_SCORE_ADJUSTMENT), encoding="ascii")
-
-
-def _lower_priority() -> None:
-    """Lower the CPU priority of this process and of what it starts."""
-    os.nice(max(0, NICENESS - os.nice(0)))
-    # Between sessions Linux compares the niceness of these groups alone, where it makes them.
-    with contextlib.suppress(OSError):
-        Path("/proc/self/autogroup").write_text(str(os.nice(0)), encoding="ascii")
 
 
 def _enter_sandbox(task: dict[str, Any]) -> None:
