@@ -162,6 +162,11 @@ class ReconstructRequest(ReconstructOptions, BlockOptions, Request):
         le=120,
         description="Of a video: so many frames of each second are taken, the sharpest ones.",
     )
+    start_from: Annotated[Path | None, ReadPath(), Spelling(metavar="RUN")] = Field(
+        None,
+        description="Begin with the Gaussians of that run, finished or stopped, or of a file of Gaussians, "
+        "instead of the sparse points; poses that the run found are taken, too.",
+    )
     resume: bool = Field(
         False,
         description="Go on with the run in the output folder, if there is one; without other options its own "
@@ -225,7 +230,7 @@ def run_config(request: ReconstructRequest) -> "ReconstructionConfig":
 
     # with options the request's configuration counts, and is checked against the run's
     given = request.model_fields_set - {
-        *("source", "output", "resume", "exports", "frames_per_second", "blocks", "memory")
+        *("source", "output", "resume", "exports", "frames_per_second", "blocks", "memory", "start_from")
     }  # fmt: skip
     # empty ones say nothing, whoever filled them in
     given -= {name for name in ("train", "assignments") if not getattr(request, name)}
@@ -305,6 +310,7 @@ def run(
         should_stop=should_stop,
         on_step=on_step,
         blocks=blocks,
+        start_from=request.start_from,
     )
     return ReconstructResult(
         files=tuple(output / name for name in (_SCENE, *config.exports, _METRICS, _REPORT)),

@@ -6,6 +6,7 @@ from octasplat.engine.dataset import Dataset, write_held_out
 from octasplat.engine.dataset.views_file import write_views
 from octasplat.engine.pipeline.output_folder import write_config
 from octasplat.engine.pipeline.run import ReconstructionRun
+from octasplat.engine.pipeline.start_scene import check_start, has_start
 from octasplat.engine.poses.photographs import notes_on_files
 from octasplat.engine.runs.config import read_config
 from octasplat.engine.runs.run_folder import (
@@ -60,6 +61,8 @@ class OpenDataset:
         if run.recorded is None:  # a run that goes on keeps the poses that it has trained with
             _repair_poses(run)
             write_views(output / VIEWS, run.dataset.views_record)
+        if has_start(output):
+            check_start(output, run.dataset, run.config.train, run.progress)
         held_out = [run.dataset.views[i].name for i in run.dataset.test_indices]
         write_held_out(output / HELD_OUT, held_out)
         if dataset_folder_of_run(output) != run.scene.resolve() or read_config(output / CONFIG) != run.config:

@@ -5,14 +5,20 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from octasplat.engine.core.errors import ConfigError, DatasetError, OutputError
+from octasplat.engine.core.errors import (
+    CheckpointError,
+    ConfigError,
+    DatasetError,
+    OutputError,
+    SceneFileError,
+)
 from octasplat.engine.core.relative_paths import normalize_name
 from octasplat.engine.core.versions import package_versions
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset.model_sources import has_model
 from octasplat.engine.poses.find_poses import read_pose_record
 from octasplat.engine.runs.config import ReconstructionConfig, read_config
-from octasplat.engine.runs.run_folder import BLOCKS, CACHE, CONFIG, EVENTS, POSES
+from octasplat.engine.runs.run_folder import BLOCKS, CACHE, CONFIG, EVENTS, POSES, START
 
 
 def claim_output(scene: Path, output: Path, config: ReconstructionConfig, resume: bool) -> bool:
@@ -63,11 +69,12 @@ def release_on_refusal(output: Path, *, is_new: bool, is_made: bool) -> Iterator
     """
     try:
         yield
-    except (DatasetError, ConfigError):
+    except (DatasetError, ConfigError, SceneFileError, CheckpointError):
         if is_new:
             (output / CONFIG).unlink()
-            (output / EVENTS).unlink()
-            shutil.rmtree(output / BLOCKS, ignore_errors=True)
+            (output / EVENTS).unlink(missing_ok=True)
+            for name in (BLOCKS, START):
+                shutil.rmtree(output / name, ignore_errors=True)
             if not _is_from_pose_search(output / POSES):
                 shutil.rmtree(output / POSES, ignore_errors=True)
             if is_made:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from octasplat.engine.blocks.piece_settings import require_blocks_possible
-from octasplat.engine.core.errors import CheckpointError
+from octasplat.engine.core.errors import CheckpointError, ConfigError
 from octasplat.engine.core.events import EventListener, JsonLinesWriter, RunFinished, broadcast
 from octasplat.engine.core.threads import use_threads
 from octasplat.engine.dataset.views_file import ViewsRecord, read_views
@@ -16,6 +16,7 @@ from octasplat.engine.pipeline.output_folder import claim_output, release_on_ref
 from octasplat.engine.pipeline.result_steps import EvaluateStep, ExportStep
 from octasplat.engine.pipeline.run import OnStep, ReconstructionRun, run_steps
 from octasplat.engine.pipeline.run_lock import lock_run_folder
+from octasplat.engine.pipeline.start_scene import keep_start
 from octasplat.engine.pipeline.train_step import TrainStep
 from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.runs.run_folder import CACHE, EVENTS, SCENE, VIEWS
@@ -36,6 +37,7 @@ def reconstruct(
     should_stop: Callable[[], bool] = lambda: False,
     on_step: OnStep | None = None,
     blocks: BlockRequest | None = None,
+    start_from: Path | None = None,
 ) -> Path:
     """Reconstruct ``scene`` into the folder ``output`` and return it.
 
@@ -54,6 +56,8 @@ def reconstruct(
         should_stop: asked now and then; True stops the run after a checkpoint.
         on_step: shown the training after each iteration of a scene that is trained as a whole; it must
             change nothing.
+        start_from: a run, finished or stopped, or a file of Gaussians to begin with instead of the sparse
+            points; None, with ``resume``, goes on as the run was begun.
         blocks: how to train in blocks; None trains the scene as a whole or, with ``resume``, as it was begun.
 
     Raises:
@@ -69,13 +73,19 @@ def reconstruct(
     """
     if not (output / SCENE).exists():
         check_writable(config.exports)
+    if blocks is not None and start_from is not None:
+        raise ConfigError(
+            "A scene that is trained in blocks begins anew; leave --blocks or --start-from out."
+        )
     if blocks is not None and (blocks.count or 1) > 1:  # of an automatic number it is known later
         require_blocks_possible(config.train, has_time_budget=config.minutes is not None)
     use_threads(threads)
     # before the claim, which makes the folder
     is_made, is_new = not output.exists(), claim_output(scene, output, config, resume)
     with lock_run_folder(output):
-        blocks = keep_request(output, blocks, is_new=is_new)
+        with release_on_refusal(output, is_new=is_new, is_made=is_made):
+            blocks = keep_request(output, blocks, is_new=is_new)
+            keep_start(scene, output, start_from, is_new=is_new)
         _run_all_steps(
             ReconstructionRun(
                 scene=scene,

@@ -1,7 +1,6 @@
 """The training step: its result is the scene, and what the training learnt beside it."""
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +20,9 @@ from octasplat.engine.gaussians.materials import reflective_fraction
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.scene_metadata import SceneMetadata
 from octasplat.engine.pipeline.run import ReconstructionRun
+from octasplat.engine.pipeline.start_scene import has_start, started_state
 from octasplat.engine.render.environment_files import write_background_map, write_environment
 from octasplat.engine.render.shots import training_pixel_angle
-from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.runs.run_folder import (
     BACKGROUND,
     BLOCKS,
@@ -43,7 +42,7 @@ from octasplat.engine.shading.recipes import material_shading
 from octasplat.engine.train.config import TrainConfig, iteration_count
 from octasplat.engine.train.initialization.initial_gaussians import initial_train_state
 from octasplat.engine.train.loop.checkpoint import load_latest_checkpoint, run_fingerprint
-from octasplat.engine.train.loop.state import MinScale
+from octasplat.engine.train.loop.state import MinScale, TrainState
 from octasplat.engine.train.loop.time_budget import make_plan, read_plan, write_plan
 from octasplat.engine.train.loop.trainer import Trainer
 from octasplat.engine.train.loop.trial_training import MATERIAL_TRIAL_RAYS, material_gain_db
@@ -90,14 +89,7 @@ def _train(run: ReconstructionRun, clock: PhaseClock) -> FlatGaussians:
         return _train_in_blocks(run, count, run.blocks.most_gaussians)
     if not any((run.output / CHECKPOINTS).glob("*.npz")):
         _warn_of_useless_materials(run)  # before the plan, which shares out what is left of the time
-    config = _plan_settings(
-        dataset=run.dataset,
-        output=run.output,
-        settings=run.config,
-        threads=run.threads,
-        should_stop=run.should_stop,
-        clock=clock,
-    )
+    config = _plan_settings(run, clock)
     nearest_world = camera_clearances(run.dataset.viewpoints, run.dataset.points)
     trainer = _make_trainer(run, config, nearest_world, clock)
     gaussians = trainer.run()
@@ -159,7 +151,7 @@ def _make_trainer(
     fingerprint = run_fingerprint(dataset, config)
     state = load_latest_checkpoint(folder, fingerprint, progress)
     if state is None:
-        state = initial_train_state(dataset, config, threads=use_threads(run.threads))
+        state = _first_state(run, config)
         if exposure_changes is not None:
             progress(Warned(f"{exposure_changes} That is learnt; exposure=false leaves it out."))
         state.seconds = clock.seconds()  # the clock of the phase, the making of the first Gaussians included
@@ -275,24 +267,28 @@ def _write_record(
     write_json(output / TRAINING, record)
 
 
-def _plan_settings(
-    dataset: Dataset,
-    output: Path,
-    settings: ReconstructionConfig,
-    threads: int,
-    should_stop: Callable[[], bool],
-    clock: PhaseClock,
-) -> TrainConfig:
+def _first_state(run: ReconstructionRun, config: TrainConfig) -> TrainState:
+    """Return the state before the first iteration: on the sparse points, or with the scene of another run."""
+    threads = use_threads(run.threads)
+    if has_start(run.output):
+        return started_state(run.output, run.dataset, config, threads, run.progress)
+    return initial_train_state(run.dataset, config, threads=threads)
+
+
+def _plan_settings(run: ReconstructionRun, clock: PhaseClock) -> TrainConfig:
     """Return the training's settings; those chosen by the time budget are recorded the first time."""
+    settings, output = run.config, run.output
     config = settings.train
     if settings.minutes is None:
         return config
     if not (output / PLAN).exists():
         began = clock.seconds()
-        first = initial_train_state(dataset, config, threads=use_threads(threads)).gaussians
+        first = _first_state(run, config).gaussians
         now = clock.seconds()
         left = 60 * settings.minutes - now - (now - began)  # the first Gaussians are made once more
-        plan = make_plan(dataset, config, first, seconds=left, threads=threads, should_stop=should_stop)
+        plan = make_plan(
+            run.dataset, config, first, seconds=left, threads=run.threads, should_stop=run.should_stop
+        )
         write_plan(output / PLAN, plan)
     # read back, so that a run that goes on has the very same numbers
     return read_plan(output / PLAN).apply_to(config)

@@ -26,7 +26,7 @@ CONFIG, EVENTS, HELD_OUT, SCENE, TRAINING, VIEWS = (
 METRICS, REPORT = "metrics.json", "report.html"
 CHECKPOINTS, CACHE, POSES = "checkpoints", "cache", "poses"
 PLAN = "plan.json"
-BLOCKS = "blocks"
+BLOCKS, START = "blocks", "start"
 ENVIRONMENT_HDR, ENVIRONMENT_EXR = "environment.hdr", "environment.exr"
 """The learnt light, for programs that show it and as it was learnt: an HDR has one exponent for all channels
 of a pixel, so that a dark channel beside a bright one is coarse."""

@@ -10,7 +10,7 @@ import pytest
 from octasplat.workers.db.connections import Connection, Pool, open_pool
 from octasplat.workers.db.events_and_logs import list_job_events, list_log_lines
 from octasplat.workers.db.ids import new_id
-from octasplat.workers.db.locks import ROW_SECONDS
+from octasplat.workers.db.locks import ROW_SECONDS, try_lock_recovery
 from octasplat.workers.db.rows import Job
 from octasplat.workers.queue import attempts
 from octasplat.workers.queue.attempts import Attempt, claim
@@ -184,6 +184,35 @@ async def test_recovery_logs_entries_that_were_lost(conninfo: str, caplog: pytes
         assert [record.message for record in caplog.records] == [
             f"job {attempt.job.id} had no entry in the queue and got a new one"
         ]
+
+
+async def test_job_without_an_entry_for_a_moment_is_left_to_its_worker(conninfo: str) -> None:
+    stalled = StalledAttempts(0.3)
+    async with open_pool(conninfo, max_size=4) as pool:
+        job = (await claimed(pool)).job
+        async with pool.connection() as connection:
+            await connection.execute(
+                "UPDATE jobs SET state = 'queued', queued_at = now() - interval '1 hour'"
+            )
+            await connection.execute("DELETE FROM procrastinate_jobs")
+        await recover_stalled_jobs(pool, SLIPS, 5, stalled)
+        assert (await fetched(pool, job.id)).slip == job.slip
+        await asyncio.sleep(0.4)
+        await recover_stalled_jobs(pool, SLIPS, 5, stalled)
+        assert (await fetched(pool, job.id)).slip != job.slip
+
+
+async def test_one_process_recovers_at_a_time(conninfo: str) -> None:
+    async with open_pool(conninfo, max_size=4) as pool:
+        attempt = await claimed(pool)
+        async with pool.connection() as connection:
+            await connection.execute("UPDATE jobs SET heartbeat_at = now() - interval '1 hour'")
+        async with pool.connection() as other:
+            async with other.transaction():
+                assert await try_lock_recovery(other)
+                assert await recover_stalled_jobs(pool, SLIPS, 5, StalledAttempts(0.0)) == 0
+            assert await recover_stalled_jobs(pool, SLIPS, 5, StalledAttempts(0.0)) == 1
+        assert (await fetched(pool, attempt.job.id)).state == "queued"
 
 
 async def test_recovery_leaves_jobs_alone_that_went_on(

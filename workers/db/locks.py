@@ -22,6 +22,7 @@ ROW_SECONDS = 10
 OWNER = 0x71756F74  # "quot"; the database's triggers know it as well
 
 TASKS = 0x7461736B  # "task"
+RECOVERY = 0x7265636F  # "reco"
 
 
 async def lock_store(connection: Connection, *, shared: bool) -> None:
@@ -38,6 +39,16 @@ async def lock_owner(connection: Connection, owner: str) -> None:
 async def lock_tasks(connection: Connection, kind: str) -> None:
     """Take the lock of a kind of task on datasets until the transaction ends."""
     await connection.execute("SELECT pg_advisory_xact_lock(%s, hashtext(%s))", [TASKS, kind])
+
+
+async def try_lock_recovery(connection: Connection) -> bool:
+    """Take the lock of recoveries until the transaction ends; False if another process has it.
+
+    It is never waited for, and so has no place in the order.
+    """
+    cursor = await connection.execute("SELECT pg_try_advisory_xact_lock(%s) AS taken", [RECOVERY])
+    row = await cursor.fetchone()
+    return row is not None and bool(row["taken"])
 
 
 async def about_to_lock_jobs(connection: Connection) -> None:

@@ -142,22 +142,26 @@ def add_initial_materials(gaussians: FlatGaussians, settings: MaterialSettings) 
     )
 
 
-def initial_train_state(dataset: Dataset, config: TrainConfig, *, threads: int = 1) -> TrainState:
+def initial_train_state(
+    dataset: Dataset, config: TrainConfig, *, threads: int = 1, gaussians: FlatGaussians | None = None
+) -> TrainState:
     """Return the state with the first Gaussians, their materials and the first background, where learnt.
 
     Args:
         dataset: the photographs.
         config: all settings of the training.
         threads: work side by side, which changes nothing that is made.
+        gaussians: to begin with, with their materials; None makes the first ones.
 
     Raises:
         DatasetError: nothing says where Gaussians could begin.
     """
     background_map = estimate_background(dataset) if config.background == "learnt" else None
-    options = InitialGaussianOptions.from_config(config, dataset)
-    gaussians = initial_gaussians(dataset, options, threads=threads, background=background_map)
-    if config.materials.learn:
-        gaussians = add_initial_materials(gaussians, config.materials)
+    if gaussians is None:
+        options = InitialGaussianOptions.from_config(config, dataset)
+        gaussians = initial_gaussians(dataset, options, threads=threads, background=background_map)
+        if config.materials.learn:
+            gaussians = add_initial_materials(gaussians, config.materials)
     state = initial_state(gaussians, config.seed)
     shading = make_shading(ShadingOptions.from_config(config), len(dataset.views), dataset.extent)
     background = find_background(shading)

@@ -98,8 +98,12 @@ def save_checkpoint(state: TrainState, folder: Path, fingerprint: str) -> Path:
     return path
 
 
-def load_checkpoint(path: Path, fingerprint: str) -> TrainState:
+def load_checkpoint(path: Path, fingerprint: str | None = None) -> TrainState:
     """Read a checkpoint back.
+
+    Args:
+        path: the file.
+        fingerprint: of the settings and photographs that it must belong to; None takes any.
 
     Raises:
         DamagedCheckpointError: the file cannot be read.
@@ -108,7 +112,8 @@ def load_checkpoint(path: Path, fingerprint: str) -> TrainState:
     try:
         arrays = _read_arrays(path)
         meta = json.loads(str(arrays.pop("meta")))
-        if meta.get("format") != CHECKPOINT_FORMAT or meta["fingerprint"] != fingerprint:
+        is_other = fingerprint is not None and meta["fingerprint"] != fingerprint
+        if meta.get("format") != CHECKPOINT_FORMAT or is_other:
             raise CheckpointError(
                 f"{path} belongs to other settings or other photographs; "
                 "give the settings it was made with, or choose another output folder."

@@ -1,0 +1,148 @@
+"""A training that begins with the scene of another run instead of the sparse points."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from octasplat.engine.core.errors import CancelledError, ConfigError
+from octasplat.engine.core.events import CheckpointWritten, Event, Noted, Warned
+from octasplat.engine.files import export_scene, read_scene
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.pipeline import reconstruct
+from octasplat.engine.runs.config import ReconstructionConfig, resolve_config
+from tests.support.tiny_dataset import make_tiny_dataset
+
+pytestmark = pytest.mark.heavy
+
+SETTINGS: dict[str, object] = {
+    "rays_per_batch": 512,
+    "sh_degree": 1,
+    "max_gaussians": 400,
+    "initial_points": 300,
+    "probe_rays": 256,
+    "exposure": True,
+    "rebuild_every": 10,
+    "checkpoint_every": 20,
+}
+UNCHANGED = {"iterations": 1, "lr.means": 1e-12, "lr.exposure": 1e-12, "lr.sh": 1e-12, "lr.opacity": 1e-12}
+
+
+def make_config(**assignments: object) -> ReconstructionConfig:
+    values = {**SETTINGS, **assignments}
+    return resolve_config(
+        "fast",
+        settings={"exports": ()},
+        assignments=[f"{name}={json.dumps(value)}" for name, value in values.items()],
+    )
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_tiny_dataset(tmp_path_factory, samples_per_side=2, points=300)
+
+
+@pytest.fixture(scope="module")
+def finished(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return reconstruct(scene, tmp_path_factory.mktemp("runs") / "finished", make_config(iterations=60))
+
+
+def gaussians(run: Path) -> FlatGaussians:
+    return read_scene(run)[0]
+
+
+def exposures(run: Path) -> dict[str, list[float]]:
+    found: dict[str, list[float]] = json.loads((run / "training.json").read_text())["exposures"]
+    return found
+
+
+def test_run_begins_with_gaussians_and_exposures_of_a_finished_one(
+    scene: Path, finished: Path, tmp_path: Path
+) -> None:
+    unchanged = reconstruct(scene, tmp_path / "next", make_config(**UNCHANGED), start_from=finished)
+    before, after = gaussians(finished), gaussians(unchanged)
+    np.testing.assert_allclose(after.means_world, before.means_world, atol=1e-6)
+    np.testing.assert_allclose(after.sh, before.sh, atol=1e-6)
+    for name, values in exposures(finished).items():
+        np.testing.assert_allclose(np.ravel(exposures(unchanged)[name]), np.ravel(values), atol=1e-6)
+    anew = reconstruct(scene, tmp_path / "anew", make_config(**UNCHANGED))
+    assert abs(gaussians(anew).means_world.mean() - before.means_world.mean()) > 1e-4
+
+
+def test_stopped_run_is_gone_on_with_by_other_settings_to_the_same_bytes(scene: Path, tmp_path: Path) -> None:
+    stopped, stop = tmp_path / "stopped", [False]
+
+    def note(event: Event) -> None:
+        stop[0] = stop[0] or isinstance(event, CheckpointWritten)
+
+    with pytest.raises(CancelledError):
+        reconstruct(scene, stopped, make_config(iterations=60), progress=note, should_stop=lambda: stop[0])
+    assert not (stopped / "scene.ply").exists()
+    other = make_config(iterations=40, sh_degree=0, exposure=False)
+    told: list[str] = []
+    whole = reconstruct(
+        scene,
+        tmp_path / "whole",
+        other,
+        start_from=stopped,
+        progress=lambda event: told.append(event.message) if isinstance(event, Noted) else None,
+    )
+    assert any("learnt anew" in sentence for sentence in told)
+    assert gaussians(whole).sh_degree == 0
+    stop[0] = False
+    parts = tmp_path / "parts"
+    with pytest.raises(CancelledError):
+        reconstruct(
+            scene, parts, other, start_from=stopped, progress=note, should_stop=lambda: stop[0], threads=1
+        )
+    shutil.rmtree(stopped)  # the run has a copy of what it begins with
+    reconstruct(scene, parts, other, resume=True)
+    assert (parts / "scene.ply").read_bytes() == (whole / "scene.ply").read_bytes()
+    with pytest.raises(ConfigError, match=r"parts was not begun with .*finished"):
+        reconstruct(scene, parts, other, resume=True, start_from=tmp_path / "finished")
+
+
+def test_file_of_gaussians_is_a_start(scene: Path, finished: Path, tmp_path: Path) -> None:
+    path = tmp_path / "half.ply"
+    half = gaussians(finished).select(slice(0, 100))
+    export_scene(half, path)
+    run = reconstruct(scene, tmp_path / "run", make_config(**UNCHANGED, max_gaussians=100), start_from=path)
+    np.testing.assert_allclose(gaussians(run).means_world, half.means_world, atol=1e-6)
+
+
+def test_unsuitable_starts_are_refused_and_leave_nothing(scene: Path, finished: Path, tmp_path: Path) -> None:
+    output, empty = tmp_path / "run", tmp_path / "empty"
+    empty.mkdir()
+    with pytest.raises(ConfigError, match=r"empty has neither scene.ply nor a checkpoint"):
+        reconstruct(scene, output, make_config(), start_from=empty)
+    with pytest.raises(ConfigError, match=r"Gaussians, and this run may have 50; .*--max-gaussians \d+"):
+        reconstruct(scene, output, make_config(max_gaussians=50, initial_points=50), start_from=finished)
+    moved = tmp_path / "moved"
+    shutil.copytree(scene, moved)
+    images = moved / "sparse" / "0" / "images.txt"
+    lines = images.read_text().splitlines()
+    for row, line in enumerate(lines):
+        words = line.split()
+        if len(words) == 10:
+            lines[row] = " ".join([*words[:7], str(float(words[7]) + 3), *words[8:]])
+    images.write_text("\n".join(lines) + "\n")
+    with pytest.raises(ConfigError, match=r"other poses than .*finished was trained with"):
+        reconstruct(moved, output, make_config(), start_from=finished)
+    assert not output.exists()
+
+
+def test_views_trained_on_before_and_held_out_now_are_told(
+    scene: Path, finished: Path, tmp_path: Path
+) -> None:
+    told: list[str] = []
+    config = make_config(**UNCHANGED).model_copy(update={"test_every": 3})
+    reconstruct(
+        scene,
+        tmp_path / "run",
+        config,
+        start_from=finished,
+        progress=lambda event: told.append(event.message) if isinstance(event, Warned) else None,
+    )
+    assert any("held out here" in sentence and "too good" in sentence for sentence in told)
