@@ -60,9 +60,9 @@ class OpenDataset:
         run.dataset = _load_dataset(run)
         if run.recorded is None:  # a run that goes on keeps the poses that it has trained with
             _repair_poses(run)
+            if has_start(output):
+                check_start(output, run.dataset, run.config.train, run.progress)
             write_views(output / VIEWS, run.dataset.views_record)
-        if has_start(output):
-            check_start(output, run.dataset, run.config.train, run.progress)
         held_out = [run.dataset.views[i].name for i in run.dataset.test_indices]
         write_held_out(output / HELD_OUT, held_out)
         if dataset_folder_of_run(output) != run.scene.resolve() or read_config(output / CONFIG) != run.config:
