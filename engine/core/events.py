@@ -37,13 +37,22 @@ class PhaseStarted(Event):
 
 @dataclass(frozen=True)
 class PhaseProgress(Event):
-    """Step ``step`` of a stage that counts its steps is done, and the share ``part`` of the next one."""
+    """Step ``step`` of a stage that counts its steps is done, and the share ``part`` of the next one.
+
+    Where steps take very different times, ``work_done`` is the share of the stage's work that is done.
+    """
 
     kind: ClassVar[str] = "stage_progress"
     stage: str
     step: int
     total_steps: int
     part: float = 0.0
+    work_done: float | None = None
+
+    def as_dict(self) -> dict[str, object]:
+        """Return the event as JSON-ready values; without the share of the work where it is not known."""
+        values = super().as_dict()
+        return values if self.work_done is not None else {k: v for k, v in values.items() if k != "work_done"}
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,9 @@ from octasplat.engine.runs.run_folder import METRICS, REPORT, SCENE, unexported_
 from octasplat.engine.runs.small_surface import small_surface
 from octasplat.engine.runs.viewer_glb import prepare_for_viewers, upright_turn
 
+SURFACE_WORK, COLOR_WORK = 5.0, 4.0
+"""Work of the textured surface, and of one color for each Gaussian, in files that are simply written."""
+
 
 class EvaluateStep:
     """Measure the held-out views; files are exported even if that fails."""
@@ -64,26 +67,44 @@ def _export(run: ReconstructionRun, names: list[str]) -> str | None:
         progress(Warned(left_out))
     options = ExportOptions(q=run.config.train.trace.q, facts=read_metadata(output))
 
+    formats = {name: exporter_for(output / name) for name in names}
+    surfaces = [name for name, exporter in formats.items() if exporter.name == SURFACE_FORMAT]
+    needs_colors = any(
+        not exporter.holds_harmonics for name, exporter in formats.items() if name not in surfaces
+    )
+    surface_work, color_work = SURFACE_WORK * bool(surfaces), COLOR_WORK * needs_colors
+    work, files_done, prepared = len(names) + surface_work + color_work, 0, 0.0
+
     def beat() -> None:
         if run.should_stop():
             raise CancelledError("Stopped while exporting; the same command with --resume goes on.")
-        progress(PhaseProgress("export", 0, len(names)))
+        report(files_done)
+
+    def report(done: int) -> None:
+        nonlocal files_done
+        files_done = done
+        progress(PhaseProgress("export", done, len(names), work_done=(prepared + done) / work))
+
+    def note_pass(done: int, total: int) -> None:
+        nonlocal prepared
+        prepared = surface_work + color_work * done / total
+        beat()
 
     plain = BakedScene(
         gaussians,
         output,
         threads=run.threads,
-        on_pass=lambda _done, _total: beat(),
+        on_pass=note_pass,
         on_unknown=lambda text: progress(Warned(text)),
     )
     surface = None
-    surfaces = [name for name in names if exporter_for(output / name).name == SURFACE_FORMAT]
     if surfaces:
         try:
             surface = small_surface(output, gaussians, threads=run.threads, scratch=output, on_pass=beat)
         except ConfigError as error:  # nothing opaque enough was seen, which is no failure of the run
             progress(Warned(f"{' and '.join(surfaces)} cannot be made: {error}"))
             names = [name for name in names if name not in surfaces]
+        prepared = surface_work
     targets = [output / name for name in names]
     for lost in dropped_on_export(gaussians, targets_with_known_format(targets), facts=options.facts):
         progress(Warned(lost))
@@ -101,6 +122,6 @@ def _export(run: ReconstructionRun, names: list[str]) -> str | None:
     _, failed = export_batch(
         targets,
         prepare,
-        on_done=lambda done: progress(PhaseProgress("export", done, len(names))),
+        on_done=report,
     )
     return failed

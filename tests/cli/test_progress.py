@@ -24,7 +24,7 @@ from octasplat.engine.core.events import (
 )
 from octasplat.engine.core.progress import stop_when_asked
 from octasplat.workers.cli.progress import ProgressBars, show_progress
-from octasplat.workers.reporting.event_lines import EventLines
+from octasplat.workers.reporting.event_lines import EventLines, ProgressState
 from octasplat.workers.reporting.wording import format_rate
 
 TRAINING = TrainingProgress(
@@ -45,6 +45,16 @@ def test_plain_lines_show_training_state():
         f"  310/1500: {STATE}, 1:23 left",
         f"Trained 310 iterations in 1:23 min: {STATE}",
     ]
+
+
+def test_time_left_follows_the_work_where_steps_differ(monkeypatch):
+    clock = iter((0.0, 60.0))
+    monkeypatch.setattr("octasplat.workers.reporting.time_left.time.monotonic", lambda: next(clock))
+    state = ProgressState()
+    state.update(PhaseStarted("export", 5))
+    state.update(PhaseProgress("export", 0, 5, work_done=0.0))
+    state.update(PhaseProgress("export", 1, 5, work_done=0.75))
+    assert state.seconds_left == pytest.approx(20.0)  # by the files alone it would be 240
 
 
 def test_plain_lines_are_rate_limited():

@@ -16,7 +16,7 @@ from octasplat.engine.core.events import (
     Warned,
 )
 from octasplat.engine.core.progress import PHASE_TITLES
-from octasplat.workers.reporting.time_left import TimeLeftEstimator
+from octasplat.workers.reporting.time_left import TimeLeftEstimator, work_of_stage
 from octasplat.workers.reporting.wording import format_training_state
 
 LINE_INTERVAL_SECONDS = 5.0
@@ -66,7 +66,9 @@ class ProgressState:
             self.seconds_left, self._pace = None, TimeLeftEstimator()
         elif isinstance(event, PhaseProgress):
             self.step, self.total = event.step, event.total_steps
-            self.seconds_left = self._pace.seconds_left(event.step + event.part, event.total_steps)
+            self.seconds_left = self._pace.seconds_left(
+                *work_of_stage(event.step, event.total_steps, event.part, event.work_done)
+            )
         elif isinstance(event, TrainingProgress):
             self.step, self.training = event.iteration, event
         elif isinstance(event, HeldOutMeasured):

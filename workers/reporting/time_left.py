@@ -3,6 +3,23 @@
 import time
 
 
+def work_of_stage(step: int, total_steps: int, part: float, work_done: float | None) -> tuple[float, float]:
+    """Return the work of a stage that is done, and all of it.
+
+    >>> work_of_stage(1, 4, 0.5, None)
+    (1.5, 4.0)
+    >>> work_of_stage(1, 4, 0.0, 0.9)
+    (0.9, 1.0)
+
+    Args:
+        step: steps done.
+        total_steps: steps in all.
+        part: share of the step under way.
+        work_done: share of the work that is done, where steps take very different times.
+    """
+    return (step + part, float(total_steps)) if work_done is None else (work_done, 1.0)
+
+
 class TimeLeftEstimator:
     """Estimates the remaining time of a stage from its speed since its first report."""
 

@@ -22,7 +22,7 @@ from octasplat.workers.queue.attempts import Attempt, FencedError
 from octasplat.workers.queue.storage_leases import storage_lease
 from octasplat.workers.reporting.event_lines import EventLines
 from octasplat.workers.reporting.events import decode_event, encode_training_progress
-from octasplat.workers.reporting.time_left import TimeLeftEstimator
+from octasplat.workers.reporting.time_left import TimeLeftEstimator, work_of_stage
 from octasplat.workers.storage.errors import StorageError
 from octasplat.workers.worker.checkpoint import Checkpoint
 from octasplat.workers.worker.task import RUN_FOLDER
@@ -169,7 +169,9 @@ class Reporter:
             "stage": event["stage"],
             "step": step,
             "total_steps": total,
-            "seconds_left": self._time_left.seconds_left(step + float(event.get("part", 0.0)), total),
+            "seconds_left": self._time_left.seconds_left(
+                *work_of_stage(step, total, float(event.get("part", 0.0)), event.get("work_done"))
+            ),
             "event": {key: value for key, value in event.items() if key != "kind"},
         }
 
