@@ -34,8 +34,8 @@ class InfoOptions(Options):
 class InfoRequest(InfoOptions, WritingRequest):
     """Tell what is in IN, the folder of a run or a file of Gaussians in any splat format.
 
-    Counts, bounds, the direction that is up, harmonics, opacities, sizes, memory, and how many Gaussians a
-    ray meets. On a terminal it shows a small picture.
+    Counts, bounds, the direction that is up, harmonics, opacities, sizes and memory. With --rays also how
+    many Gaussians a ray meets and, on a terminal, a small picture.
     """
 
     former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.DATASET
@@ -44,6 +44,11 @@ class InfoRequest(InfoOptions, WritingRequest):
     dataset: DatasetFolder = Field(
         None,
         description="Take the cameras of the photographs in this folder.  [default: those the run keeps]",
+    )
+    rays: bool = Field(
+        False,
+        description="Trace a small picture, too, which tells how many Gaussians a ray meets; the first time "
+        "this compiles the tracer. --picture does so as well.",
     )
     picture: Annotated[Path | None, Spelling(metavar="FILE.png")] = Field(
         None, description="Write a small picture of the scene, too."
@@ -63,9 +68,9 @@ class InfoResult(Result):
         up_world: the direction that points up; known of a run, a guess of a file.
         origin_world: where the scene has its origin; positions of ``scene`` are about it.
         scene: counts, bounds and sizes of the Gaussians.
-        hits: how many Gaussians the rays of the picture meet.
+        hits: how many Gaussians the rays of the picture meet; None where none was traced.
         picture_srgb: the scene from the place of the run's first photograph, or from a turntable; display
-            values, of shape (height, width, 3).
+            values, of shape (height, width, 3); None where none was traced.
     """
 
     source: Path
@@ -74,8 +79,8 @@ class InfoResult(Result):
     up_world: tuple[float, float, float]
     origin_world: tuple[float, float, float] = NO_ORIGIN
     scene: InstanceOf[SceneStatistics]
-    hits: InstanceOf[HitStatistics]
-    picture_srgb: InstanceOf[np.ndarray] = Field(repr=False)
+    hits: InstanceOf[HitStatistics] | None = None
+    picture_srgb: InstanceOf[np.ndarray] | None = Field(None, repr=False)
 
     def facts(self) -> dict[str, Any]:
         """Return everything but the picture, as JSON values."""
@@ -93,7 +98,7 @@ class InfoResult(Result):
             **scene,
             "opacity_edges": OPACITY_EDGES,
             "scale_quantiles_of": QUANTILES,
-            "hits": asdict(self.hits),
+            **({"hits": asdict(self.hits)} if self.hits is not None else {}),
         }
 
     def lines(self) -> tuple[str, ...]:
@@ -121,8 +126,14 @@ class InfoResult(Result):
             f"{2 * scene.seen.half_height:.3g} high, {2 * scene.seen.radius:.3g} across",
             f"  size        {quantiles} (larger deviation; 1, 10, 50, 90, 99 in 100)",
             f"  shape       {scene.flatness_median:.2g} (smaller over larger deviation, median)",
-            f"  hits a ray  {hits.mean:.0f}, of one in 20 more than {hits.p95:.0f}; "
-            f"{100 * hits.share:.0f} % of the picture's rays meet any",
+            *(
+                ()
+                if hits is None
+                else (
+                    f"  hits a ray  {hits.mean:.0f}, of one in 20 more than {hits.p95:.0f}; "
+                    f"{100 * hits.share:.0f} % of the picture's rays meet any",
+                )
+            ),
             "  opacity",
             *self._opacity_histogram_lines(),
         )
@@ -153,7 +164,7 @@ def run(
     from octasplat.engine.core.writing import write_json
     from octasplat.engine.files import read_metadata
     from octasplat.engine.operations.render_source import open_stage_scene
-    from octasplat.engine.operations.scene_inspection import inspect_scene
+    from octasplat.engine.operations.scene_inspection import inspect_scene, trace_picture
     from octasplat.engine.operations.written_files import check_targets
     from octasplat.engine.render.image_files import write_png
 
@@ -161,7 +172,9 @@ def run(
     files = tuple(path for path in (request.output, request.picture) if path is not None)
     check_targets("info", files, [source, request.dataset], overwrite=request.overwrite)
     opened = open_stage_scene(source, progress, dataset=request.dataset, threads=threads)
-    found = inspect_scene(opened, None if request.up is None else axis_named(request.up))
+    up = None if request.up is None else axis_named(request.up)
+    found = inspect_scene(opened, up)
+    traced = trace_picture(opened, up) if request.rays or request.picture is not None else None
     x, y, z = found.up_world.tolist()
     result = InfoResult(
         files=files,
@@ -172,12 +185,12 @@ def run(
         up_world=(x, y, z),
         origin_world=read_metadata(source).origin_world,
         scene=found.scene,
-        hits=found.hits,
-        picture_srgb=found.picture_srgb,
+        hits=None if traced is None else traced.hits,
+        picture_srgb=None if traced is None else traced.rgb_srgb,
     )
     stop_if(should_stop)
-    if request.picture is not None:
-        write_png(request.picture, found.picture_srgb)
+    if request.picture is not None and traced is not None:
+        write_png(request.picture, traced.rgb_srgb)
     if request.output is not None:
         write_json(request.output, result.facts())
     return result

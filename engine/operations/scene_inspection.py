@@ -26,17 +26,26 @@ class SceneInspection:
 
     Attributes:
         scene: on its Gaussians.
-        hits: on the rays of the picture.
         up_world: the direction that points up; known of a run, a guess of a file.
-        picture_srgb: display values, from the first photograph's place of a run.
         photographs: how many; None of a file.
     """
 
     scene: SceneStatistics
-    hits: HitStatistics
     up_world: Float64[np.ndarray, "3"]
-    picture_srgb: Float32[np.ndarray, "h w 3"]
     photographs: int | None
+
+
+@dataclass(frozen=True)
+class TracedPicture:
+    """A small picture of a scene.
+
+    Attributes:
+        rgb_srgb: display values, from the first photograph's place of a run.
+        hits: of its rays.
+    """
+
+    rgb_srgb: Float32[np.ndarray, "h w 3"]
+    hits: HitStatistics
 
 
 def inspect_scene(scene: StageScene, up_world: Float64[np.ndarray, "3"] | None) -> SceneInspection:
@@ -45,9 +54,19 @@ def inspect_scene(scene: StageScene, up_world: Float64[np.ndarray, "3"] | None) 
     Raises:
         ConfigError: the cameras of the photographs share no centre or no up direction.
     """
-    table = scene.turntable(up_world)
+    up = scene.turntable(up_world).up_world
+    photographs = None if scene.photographs is None else len(scene.photographs.views)
+    return SceneInspection(scene_statistics(scene.gaussians, up), up, photographs)
+
+
+def trace_picture(scene: StageScene, up_world: Float64[np.ndarray, "3"] | None) -> TracedPicture:
+    """Trace a small picture of a scene, as :func:`inspect_scene` does of its facts.
+
+    Raises:
+        ConfigError: the cameras of the photographs share no centre or no up direction.
+    """
     if scene.photographs is None:
-        (camera,) = turntable_cameras(table, 1, PICTURE_SIDE_PX, PICTURE_SIDE_PX)
+        (camera,) = turntable_cameras(scene.turntable(up_world), 1, PICTURE_SIDE_PX, PICTURE_SIDE_PX)
         image = camera.rays()
     else:
         image = photograph_cameras(scene.photographs, np.array([0]), PICTURE_SIDE_PX)[0].rays()
@@ -55,10 +74,4 @@ def inspect_scene(scene: StageScene, up_world: Float64[np.ndarray, "3"] | None) 
     tracer = make_tracer(scene.settings, threads=scene.threads, is_used_once=True)
     tracer.build(scene.gaussians)
     picture = render_rays(tracer, image, scene.background_srgb)
-    return SceneInspection(
-        scene_statistics(scene.gaussians, table.up_world),
-        hit_statistics(tracer, image),
-        table.up_world,
-        picture.rgb_srgb,
-        None if scene.photographs is None else len(scene.photographs.views),
-    )
+    return TracedPicture(picture.rgb_srgb, hit_statistics(tracer, image))

@@ -21,7 +21,7 @@ def test_info_of_file_matches_gaussians(run, octasplat, tmp_path):
     gaussians = gaussians.with_channels({"roughness": np.ones((count, 1), np.float32)})
     gaussians.means_world[0] = (1000, 0, 0)  # a stray
     write_gaussian_ply(gaussians, tmp_path / "scene.ply")
-    result = octasplat("info", tmp_path / "scene.ply", "--up", "z", "--json")
+    result = octasplat("info", tmp_path / "scene.ply", "--up", "z", "--json", "--rays")
     assert result.exit_code == 0, result.output
     facts = json.loads(result.stdout)
     assert facts["count"] == count and facts["sh_degree"] == gaussians.sh_degree
@@ -32,6 +32,7 @@ def test_info_of_file_matches_gaussians(run, octasplat, tmp_path):
     assert facts["scale_quantiles"][2] == pytest.approx(np.median(gaussians.scales.max(axis=1)), rel=1e-6)
     assert facts["up_world"] == [0, 0, 1] and facts["photographs"] is None
     assert 0 < facts["hits"]["mean"] <= facts["hits"]["p95"] and 0 < facts["hits"]["share"] <= 1
+    assert "hits" not in json.loads(octasplat("info", tmp_path / "scene.ply", "--json").stdout)
     words = octasplat("info", tmp_path / "scene.ply").stdout
     assert f"{count:,} Gaussians" in words and "roughness (1)" in words and "\x1b" not in words
 
@@ -65,7 +66,9 @@ def test_info_job_and_request_match_command(run, octasplat, tmp_path):
     assert (results / "picture.png").read_bytes() == (tmp_path / "look.png").read_bytes()
     assert any("the result: " in getattr(event, "message", "") for event in heard)
 
-    result = OPERATION.run(InfoRequest(source=run.output, output=tmp_path / "facts.json"), threads=1)
+    result = OPERATION.run(
+        InfoRequest(source=run.output, output=tmp_path / "facts.json", rays=True), threads=1
+    )
     assert json.loads((tmp_path / "facts.json").read_text()) == facts
     assert result.scene.count == facts["count"] and result.files == (tmp_path / "facts.json",)
-    assert result.lines() == tuple(octasplat("info", run.output).stdout.splitlines())
+    assert result.lines() == tuple(octasplat("info", run.output, "--rays").stdout.splitlines())

@@ -21,7 +21,7 @@ THUMBNAIL_COLUMNS = 60
 def info(printer: Printer, threads: int, **given: Any) -> None:
     """Look at a scene."""
     result = run_operation(OPERATION, request_from_options(InfoRequest, given), printer, threads=threads)
-    if sys.stdout.isatty() and not printer.hides_progress:
+    if result.picture_srgb is not None and sys.stdout.isatty() and not printer.hides_progress:
         click.echo(_terminal_image(result.picture_srgb))
 
 
