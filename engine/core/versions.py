@@ -21,7 +21,7 @@ PACKAGES = (
 )
 
 
-RESULTS_VERSION = 2
+RESULTS_VERSION = 3
 """Raised whenever the same settings give other results than before: what was begun under one number is begun
 anew under another, rather than gone on with."""
 

@@ -2,8 +2,8 @@
 
 What a ray shows is linear in the colors of the Gaussians: W c, where W holds their weights along the rays.
 So the colors that come nearest to the pictures of the whole scene, taken from given cameras, are a
-least-squares problem, which conjugate gradients solve in a few steps; W is the forward pass of the tracer
-with colors as features, its transpose the backward pass.
+least-squares problem, which conjugate gradients solve in a few steps; W is sparse, and comes from one trace
+of the pictures' rays.
 """
 
 from collections.abc import Callable, Sequence
@@ -11,16 +11,19 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64
+from scipy.sparse import csr_array
 
 from octasplat.engine.core.rays import ImageRays, RayBatch
-from octasplat.engine.gaussians.channels import Channels
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
 from octasplat.engine.gaussians.spherical_harmonics import sh_basis
 from octasplat.engine.render.renderer import tile_order
-from octasplat.engine.trace.protocol import TraceGradients, Tracer
+from octasplat.engine.trace.protocol import Recording, Tracer, TraceSettings
+from octasplat.engine.trace.ray_hits import blend_weights
 
 CG_ITERATIONS = 4
 """More follow the given cameras closer, and others less."""
+MIN_WEIGHT = 1 / 512
+"""Weights below this, which no display shows, are left out: they are many and fill the memory."""
 REGULARISATION = 0.02
 """Weight, in rays, that holds a Gaussian at its mean color; those that are hardly seen stay there."""
 
@@ -48,93 +51,98 @@ def fit_colors_to_cameras(
 ) -> Float32[np.ndarray, "n 3"]:
     """Return the constant colors that reproduce the cameras' images best, by least squares.
 
-    Small images do: each needs one trace and one backward pass a step.
+    Small images do.
 
     Args:
         gaussians: the scene.
         tracer: with settings as the scene was trained with; it is built anew.
         images: make the rays of each camera.
         steps: of the conjugate gradients; 0 gives the mean of what the cameras see of each Gaussian.
-        on_pass: called with (passes over the images done, total); it may raise to stop.
+        on_pass: called with (passes done, total), one for each image and one for the steps; it may raise to
+            stop.
 
     Returns:
         Display values in [0, 1]; those of the constant harmonic for Gaussians that no camera sees.
     """
-    batches = [_rays_in_tile_order(make()) for make in images]
-    on_pass(0, steps + 2)
+    on_pass(0, len(images) + 1)
     tracer.build(gaussians)
-    # --- what each Gaussian shows each camera, weighted by how much it is seen ---
-    targets, sums, weights = [], np.zeros((len(gaussians), 3)), np.zeros(len(gaussians))
-    for rays in batches:
+    parts, targets = [], []
+    sums, weights = np.zeros((len(gaussians), 3)), np.zeros(len(gaussians))
+    for number, make in enumerate(images):
+        rays = _rays_in_tile_order(make())
         traced = tracer.trace(rays, record=True)
-        targets.append(traced.rgb_srgb.astype(np.float64))
+        targets.append(traced.rgb_srgb)
         assert traced.recording is not None
-        # backward of zeros: only the sums of weights are wanted
-        found = tracer.backward(traced.recording, TraceGradients(np.zeros_like(traced.rgb_srgb))).numpy()
-        away = gaussians.means_world[found.ids] - rays.origins_world[0]
-        away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
-        sums[found.ids] += found.weight_sums[:, None] * _evaluate_colors(gaussians.select(found.ids), away)
-        weights[found.ids] += found.weight_sums
+        of_rays = _weight_matrix(gaussians, rays, traced.recording, tracer.settings)
         del traced  # its recording's memory serves the next one
-    on_pass(1, steps + 2)
+        # what each Gaussian shows this camera, weighted by how much it is seen
+        seen = np.asarray(of_rays.sum(axis=0), np.float64).ravel()
+        ids = np.flatnonzero(seen)
+        away = gaussians.means_world[ids] - rays.origins_world[0]
+        away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
+        sums[ids] += seen[ids, None] * _evaluate_colors(gaussians.select(ids), away)
+        weights += seen
+        parts.append(of_rays)
+        on_pass(number + 1, len(images) + 1)
     means = np.where(
         weights[:, None] > 0, sums / np.maximum(weights, 1e-12)[:, None], gaussians.base_rgb_srgb
     )
-    if steps == 0 or not batches:
+    if steps == 0 or not parts:
         return np.clip(means, 0, 1).astype(np.float32)
-    solve = _NormalEquations(replace(gaussians.with_base_color_only(), channels=Channels()), tracer, batches)
     colors = _conjugate_gradients(
-        normal=solve, targets=targets, start=means, weights=weights, steps=steps, on_pass=on_pass
+        blend=parts,
+        targets=targets,
+        start=means,
+        weights=weights,
+        steps=steps,
     )
+    on_pass(len(images) + 1, len(images) + 1)
     return np.clip(colors, 0, 1).astype(np.float32)
 
 
-class _NormalEquations:
-    """W^T (W c - y) over all images."""
+def _weight_matrix(
+    gaussians: FlatGaussians, rays: RayBatch, recording: Recording, settings: TraceSettings
+) -> csr_array:
+    """Return the weight of each Gaussian along each ray, of shape (rays, Gaussians), without tiny ones.
 
-    def __init__(self, gaussians: FlatGaussians, tracer: Tracer, batches: Sequence[RayBatch]) -> None:
-        self._features = np.zeros((len(gaussians), 3), np.float32)
-        self._tracer, self._batches = tracer, batches
-        tracer.build(gaussians, self._features)
-
-    def __call__(
-        self, colors: Float64[np.ndarray, "n 3"], targets: Sequence[Float64[np.ndarray, "r 3"]] | None = None
-    ) -> Float64[np.ndarray, "n 3"]:
-        self._features[...] = colors
-        self._tracer.refresh()
-        out = np.zeros(colors.shape)
-        for number, rays in enumerate(self._batches):
-            traced = self._tracer.trace(rays, record=True)
-            assert traced.recording is not None
-            rest = traced.features if targets is None else traced.features - targets[number]
-            gradients = TraceGradients(np.zeros_like(traced.rgb_srgb), features=rest.astype(np.float32))
-            found = self._tracer.backward(traced.recording, gradients).numpy()
-            out[found.ids] += found.features
-            del traced  # its recording's memory serves the next one
-        return out
+    The others are scaled up to the same sum, so that the colors do not have to make up for what is left out.
+    """
+    found = blend_weights(gaussians, rays, recording, settings)
+    ray = np.repeat(np.arange(len(found.counts)), found.counts)
+    is_kept = found.weights >= MIN_WEIGHT
+    ray_kept, kept = ray[is_kept], found.weights[is_kept]
+    rest = np.bincount(ray_kept, kept, minlength=len(found.counts))
+    total = np.bincount(ray, found.weights, minlength=len(found.counts))
+    scale = np.divide(total, rest, out=np.ones_like(rest), where=rest > 0)
+    ends = np.concatenate([[0], np.cumsum(np.bincount(ray_kept, minlength=len(found.counts)))]).astype(
+        np.int32
+    )
+    values = (kept * scale[ray_kept]).astype(np.float32)
+    return csr_array((values, found.ids[is_kept], ends), (len(found.counts), len(gaussians)))
 
 
 def _conjugate_gradients(
-    normal: _NormalEquations,
-    targets: Sequence[Float64[np.ndarray, "r 3"]],
+    blend: Sequence[csr_array],
+    targets: Sequence[Float32[np.ndarray, "r 3"]],
     start: Float64[np.ndarray, "n 3"],
     weights: Float64[np.ndarray, " n"],
     steps: int,
-    on_pass: Callable[[int, int], None],
 ) -> Float64[np.ndarray, "n 3"]:
     """Take steps towards the minimum of |W c - y|^2 + r |c - start|^2, each channel on its own.
 
     r is :data:`REGULARISATION`.
     """
     scale = (weights + REGULARISATION)[:, None]  # preconditioner: about the diagonal of W^T W
-    colors = start.copy()
-    rest = -normal(colors, targets)
-    on_pass(2, steps + 2)
+    colors, rest = start.copy(), np.zeros_like(start)
+    for of_rays, target in zip(blend, targets, strict=True):
+        rest += of_rays.T @ (target - of_rays @ colors)
     preconditioned = rest / scale
     direction = preconditioned.copy()
     product = (rest * preconditioned).sum(axis=0)
-    for step in range(steps):
-        image = normal(direction) + REGULARISATION * direction
+    for _ in range(steps):
+        image = REGULARISATION * direction
+        for of_rays in blend:
+            image += of_rays.T @ (of_rays @ direction)
         curvature = (direction * image).sum(axis=0)
         length = np.divide(product, curvature, out=np.zeros(3), where=curvature > 0)
         colors += length * direction
@@ -142,7 +150,6 @@ def _conjugate_gradients(
         preconditioned = rest / scale
         before, product = product, (rest * preconditioned).sum(axis=0)
         direction = preconditioned + np.divide(product, before, out=np.zeros(3), where=before > 0) * direction
-        on_pass(min(step + 3, steps + 2), steps + 2)
     return colors
 
 

@@ -131,6 +131,10 @@ class Recording(Protocol):
         """Return the hit count of each ray, and the ids of all hits, ray by ray and front to back."""
         ...
 
+    def alphas_by_ray(self) -> Float32[np.ndarray, " h"] | None:
+        """Return the opacities at all hits, in the order of the ids; None where they are not kept."""
+        ...
+
 
 @dataclass
 class TraceGradients:

@@ -85,6 +85,38 @@ def batched_ray_hits(
         first = last
 
 
+@dataclass(frozen=True)
+class BlendWeights:
+    """Weights of the Gaussians along rays.
+
+    Attributes:
+        counts: hits of each ray.
+        ids: number of each hit's Gaussian, ray by ray and front to back.
+        weights: alpha T of each hit.
+    """
+
+    counts: Int64[np.ndarray, " r"]
+    ids: Int32[np.ndarray, " h"]
+    weights: Float64[np.ndarray, " h"]
+
+
+def blend_weights(
+    gaussians: FlatGaussians, rays: RayBatch, recording: Recording, settings: TraceSettings
+) -> BlendWeights:
+    """Return the weights with which the Gaussians are blended along rays.
+
+    They are read from the recording where it keeps opacities, and computed again elsewhere. The arguments are
+    those of :func:`batched_ray_hits`.
+    """
+    counts, ids = recording.ids_by_ray()
+    wide = counts.astype(np.int64)
+    if (alphas := recording.alphas_by_ray()) is not None:
+        alpha = alphas.astype(np.float64)
+        return BlendWeights(wide, ids, alpha * np.exp(_segmented_exclusive_cumsum(np.log1p(-alpha), wide)))
+    parts = [hits.weight for _, hits in batched_ray_hits(gaussians, rays, recording, settings)]
+    return BlendWeights(wide, ids, np.concatenate([np.empty(0), *parts]))
+
+
 def dominant_gaussians(
     gaussians: FlatGaussians, rays: RayBatch, recording: Recording, settings: TraceSettings
 ) -> Int32[np.ndarray, " r"]:

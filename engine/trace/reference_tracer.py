@@ -42,6 +42,9 @@ class ReferenceRecording:
         counts = np.array([len(ids) for ids in self.ids], np.int32)
         return counts, np.concatenate([np.empty(0, np.int32), *self.ids]).astype(np.int32)
 
+    def alphas_by_ray(self) -> None:
+        """Return None: opacities are not kept."""
+
 
 class ReferenceTracer:
     """The reference implementation behind the tracer protocol.

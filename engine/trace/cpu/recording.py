@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Int32, Int64
+from jaxtyping import Float32, Int32, Int64
 
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.trace.cpu.kernels.kernel_args import HitArrays, PacketHits, SharedSortHits, TraceLimits
@@ -59,8 +59,7 @@ class CpuRecording:
         if isinstance(self.packet_hits, SharedSortHits):
             rows = [self.ids_of_ray(ray) for ray in range(len(self.counts))]
             return self.counts, np.concatenate([np.empty(0, np.int32), *rows])
-        firsts = np.cumsum(self.counts, dtype=np.int64) - self.counts
-        places = np.arange(int(self.counts.sum())) + np.repeat(self.hits.starts - firsts, self.counts)
+        places = self._hit_places()
         leads = np.full(len(self.counts), -1, np.int64)  # first ray of each ray's packet
         for first, last in self.packets.tolist():
             leads[first:last] = first
@@ -71,3 +70,12 @@ class CpuRecording:
         slots = first_hit_index.py_func(lead[~alone], self.limits) + self.packet_hits.slots[places[~alone]]
         ids[~alone] = self.packet_hits.slot_ids[slots]
         return self.counts, ids
+
+    def alphas_by_ray(self) -> Float32[np.ndarray, " h"] | None:
+        """Return the opacities at all hits, in the order of the ids; None where packets share one order."""
+        return None if isinstance(self.packet_hits, SharedSortHits) else self.hits.alphas[self._hit_places()]
+
+    def _hit_places(self) -> Int64[np.ndarray, " h"]:
+        """Return where the hits of all rays are in the arrays of ``hits``, ray by ray."""
+        firsts = np.cumsum(self.counts, dtype=np.int64) - self.counts
+        return np.arange(int(self.counts.sum())) + np.repeat(self.hits.starts - firsts, self.counts)
