@@ -8,6 +8,7 @@ sparse, colmap/sparse, distorted/sparse, each also with a number below it: camer
 transforms.json, or transforms_train.json, transforms_test.json and transforms_val.json, and <name>.ply with
                                     the points that they name: poses as nerfstudio, instant-ngp and Blender
                                     scenes have them
+gcp_list.txt, control_points.csv    ground control points, see :mod:`octasplat.engine.georeference`
 """
 
 import re
@@ -38,6 +39,7 @@ MASK_ENDING = "_mask"
 _MODEL_FILE = re.compile(
     r"((colmap/|distorted/)?sparse(/[0-9]+)?/)?(cameras|images|points3D|rigs|frames)\.(bin|txt)"
 )
+_CONTROL_FILE = re.compile(r"gcp_list\.txt|control_points\.csv")
 _POSES_FILE = re.compile(r"transforms(_train|_test|_val)?\.json")
 _POINTS_FILE = re.compile(r"[^/]+\.ply", re.IGNORECASE)
 _MODEL_ELSEWHERE = re.compile(r"(.*/)?images\.(bin|txt)")
@@ -58,6 +60,7 @@ class FileRole(Enum):
     IMAGE = "image"
     MASK = "mask"
     MODEL = "model"
+    CONTROL = "control"
     OTHER = "other"
 
 
@@ -101,7 +104,7 @@ def lay_out_scene(paths: Sequence[str]) -> SceneLayout:
     unused = _unused_model_files(names.values())
     files: dict[str, str] = {}
     for path, name in names.items():
-        if name not in unused and file_role(name) in (FileRole.MODEL, FileRole.MASK):
+        if name not in unused and file_role(name) in (FileRole.MODEL, FileRole.MASK, FileRole.CONTROL):
             files[name] = path
         elif name.startswith(top) and is_photograph(name, results):
             files[f"images/{name.removeprefix(top)}"] = path
@@ -143,6 +146,8 @@ def file_role(name: str) -> FileRole:
         return FileRole.OTHER
     if any(pattern.fullmatch(name) for pattern in (_MODEL_FILE, _POSES_FILE, _POINTS_FILE)):
         return FileRole.MODEL
+    if _CONTROL_FILE.fullmatch(name):
+        return FileRole.CONTROL
     top, slash, rest = name.partition("/")
     if slash and rest and _is_picture(rest):
         return {"images": FileRole.IMAGE, "masks": FileRole.MASK}.get(top, FileRole.OTHER)

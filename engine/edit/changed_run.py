@@ -4,14 +4,16 @@ import json
 import os
 import shutil
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from octasplat.engine.core.errors import OutputError
+from octasplat.engine.core.georeference import GEOREFERENCE_FILE, is_similarity, write_georeference
 from octasplat.engine.core.writing import report_disk_full, write_json
-from octasplat.engine.edit.run_transform import is_similarity, write_transformed_run_files
+from octasplat.engine.edit.run_transform import write_transformed_run_files
 from octasplat.engine.files import read_metadata
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.engine.gaussians.model import FlatGaussians
@@ -90,7 +92,9 @@ def write_edited_run(
                     "Cameras and learnt light cannot follow a scene that was mirrored, sheared or scaled "
                     f"unevenly, so {target} holds the scene alone.",
                 )
-            write_gaussian_ply(gaussians, partial / SCENE, facts=metadata)
+            if metadata.georeference is not None:
+                write_georeference(partial / GEOREFERENCE_FILE, metadata.georeference)
+            write_gaussian_ply(gaussians, partial / SCENE, facts=replace(metadata, georeference=None))
             write_json(partial / EDITS_FILE, [*_read_edits(source), dict(edit_record)])
             partial.replace(target)
     except OSError as error:

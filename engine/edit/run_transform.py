@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
+from octasplat.engine.core.georeference import similarity_scale
 from octasplat.engine.core.local_origin import Origin
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset.views_file import read_views, write_views
@@ -31,18 +32,6 @@ from octasplat.engine.runs.run_folder import (
 from octasplat.engine.shading.background import UP_WORLD
 from octasplat.engine.shading.environment_frame import environment_frame
 
-_TOLERANCE = 1e-6
-"""Of the scale: how far a matrix may be from a similarity, which is what rounding makes of one."""
-
-
-def is_similarity(matrix: Float[np.ndarray, "4 4"]) -> bool:
-    """Return whether an affine map consists of rotation, translation and uniform scale, as cameras need."""
-    linear = np.asarray(matrix, np.float64)[:3, :3]
-    scale = _scale_of(matrix)
-    return scale > 0 and bool(
-        np.allclose(linear @ linear.T, scale**2 * np.eye(3), rtol=0, atol=_TOLERANCE * scale**2)
-    )
-
 
 def write_transformed_run_files(
     source: Path, target: Path, matrix: Float[np.ndarray, "4 4"], origin_world: Origin
@@ -55,13 +44,14 @@ def write_transformed_run_files(
     Args:
         source: folder of the run.
         target: folder to write into.
-        matrix: a similarity, see :func:`is_similarity`, between points about their local origins.
+        matrix: a similarity, see :func:`octasplat.engine.core.georeference.is_similarity`, between points
+            about their local origins.
         origin_world: local origin of the result.
 
     Returns:
         What is not as exact as it was, a sentence each.
     """
-    scale, turn = _scale_of(matrix), _rotation_of(matrix)
+    scale, turn = similarity_scale(matrix), _rotation_of(matrix)
     for name in (EVENTS, HELD_OUT):
         if (source / name).exists():
             shutil.copyfile(source / name, target / name)
@@ -145,10 +135,6 @@ def _texel_directions(height: int) -> Float64[np.ndarray, "t 3"]:
     round_ = np.pi * ((np.arange(2 * height) + 0.5) / height - 1.0)
     down, round_ = (part.ravel() for part in np.meshgrid(down, round_, indexing="ij"))
     return np.stack([np.sin(down) * np.sin(round_), np.cos(down), np.sin(down) * np.cos(round_)], axis=1)
-
-
-def _scale_of(matrix: Float[np.ndarray, "4 4"]) -> float:
-    return float(np.cbrt(np.linalg.det(np.asarray(matrix, np.float64)[:3, :3])))
 
 
 def _rotation_of(matrix: Float[np.ndarray, "4 4"]) -> Float64[np.ndarray, "3 3"]:

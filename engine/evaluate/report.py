@@ -15,6 +15,7 @@ from jaxtyping import Float32
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
 from octasplat.engine.core.errors import OutputError
+from octasplat.engine.core.georeference import Georeference
 from octasplat.engine.core.writing import write_text
 from octasplat.engine.evaluate.curves import format_axis_duration, training_charts
 from octasplat.engine.evaluate.gallery import (
@@ -246,6 +247,8 @@ def _run_facts(metrics: Mapping[str, object], views: int) -> list[str]:
         facts.append(f"resolution {resolution}")
     if metrics.get("seed") is not None:
         facts.append(f"seed {metrics['seed']}")
+    if (place := metrics.get("georeference")) is not None:
+        facts += Georeference.model_validate(place).facts()
     if taken := metrics.get("taken_near"):
         facts.append(
             f"{_format_thousands(int(_as_number(taken, 0)))} Gaussians too near to a camera were taken away"

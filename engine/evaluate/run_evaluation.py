@@ -9,6 +9,7 @@ import numpy as np
 
 from octasplat.engine.core.errors import ConfigError, DatasetError, OutputError
 from octasplat.engine.core.events import EventListener, PhaseProgress, Warned
+from octasplat.engine.core.georeference import GEOREFERENCE_FILE, read_georeference
 from octasplat.engine.core.progress import counted_phase, phase
 from octasplat.engine.core.threads import use_threads
 from octasplat.engine.core.versions import package_versions
@@ -235,6 +236,7 @@ def measure_run(
             "versions": package_versions(),
             **{key: training[key] for key in TRAINING_KEYS if key in training},
             **_pose_facts(output),
+            **_place_facts(output),
             **({"exposure": ESTIMATED_EXPOSURE_NOTE} if "exposures" in training and into is None else {}),
         },
         config=json.loads((output / CONFIG).read_text(encoding="utf-8")),
@@ -324,3 +326,9 @@ def _pose_facts(output: Path) -> dict[str, object]:
     record = read_pose_record(output / POSES)
     known = {name: record[name] for name in ("placed", "photographs", "moved", "lenses") if name in record}
     return {"poses": known} if known else {}
+
+
+def _place_facts(output: Path) -> dict[str, object]:
+    """Return the georeference of a run, where it has one."""
+    found = read_georeference(output / GEOREFERENCE_FILE)
+    return {} if found is None else {"georeference": found.model_dump(mode="json")}

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from octasplat.engine.core.durations import format_duration
+from octasplat.engine.core.georeference import Georeference
 from octasplat.engine.runs.result_files import file_label
 
 _METRICS = (
@@ -70,9 +71,16 @@ def summarize_run(output: Path, exports: Iterable[str]) -> list[str]:
         *_training_views(metrics.get("training_views") or {}),
         f"{metrics['gaussians']:,} Gaussians after {metrics['iterations']:,} iterations, "
         f"trained in {format_duration(metrics['seconds'])}",
+        *_place(metrics),
         *(f"{label + ':':10}{output / name}" for label, name in files if (output / name).exists()),
         f"{'In 3D:':10}octasplat view {shlex.quote(str(output))}",
     ]
+
+
+def _place(metrics: dict[str, Any]) -> list[str]:
+    """Return a line on the georeference."""
+    known = metrics.get("georeference")
+    return [] if known is None else ["; ".join(Georeference.model_validate(known).facts())]
 
 
 def _training_views(known: dict[str, Any]) -> list[str]:

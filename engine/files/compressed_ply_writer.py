@@ -9,8 +9,8 @@ from octasplat.engine.core.ply_container import PlyWriteElement, write_ply
 from octasplat.engine.files.compressed_ply import CHUNK_SIZE, PATTERNS, SH_RANGE
 from octasplat.engine.files.encodings import SQRT_HALF, smallest_three
 from octasplat.engine.files.export_options import ExportOptions
-from octasplat.engine.files.gaussian_ply import origin_comments
 from octasplat.engine.files.kd_split import kd_order
+from octasplat.engine.files.place_comments import place_comments
 from octasplat.engine.files.range_losses import find_harmonic_losses, find_position_losses
 from octasplat.engine.files.registry import Exporter, register
 from octasplat.engine.files.splat_rows import select_for_export
@@ -60,7 +60,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
         steps = np.clip(np.floor((rest / SH_RANGE + 0.5) * 256.0), 0, 255).astype(np.uint8)
         dtype = np.dtype([(f"f_rest_{k}", "u1") for k in range(steps.shape[1])])
         elements.append(PlyWriteElement("sh", count, dtype, [steps.view(dtype)[:, 0]]))
-    write_ply(path, elements, origin_comments(options.facts.origin_world))
+    write_ply(path, elements, place_comments(options.facts.origin_world, options.facts.georeference))
     return (path,)
 
 

@@ -6,7 +6,8 @@ deviations) and ``rot_0..3`` (w, x, y, z). The flat axis, the normal r1, is axis
 every viewer of 3DGS files shows the scene. A comment ``near_world`` gives the distance from a camera at which
 it begins to be seen, as in training, ``pixel_rad`` the angle of a pixel that it was trained with, and
 ``turned_beyond`` which normals, that point outwards, are turned, so that one file is one picture. A comment
-``origin_world`` is to be added to all positions where coordinates are large.
+``origin_world`` is to be added to all positions where coordinates are large, and ``georeference_matrix``
+takes what comes out to metres, see :mod:`octasplat.engine.core.georeference`.
 
 Named channels come last, ``metallic`` or ``albedo_0..2``, and a comment ``octasplat_channel albedo 3`` says
 of each that it is one.
@@ -15,7 +16,7 @@ of each that it is one.
 import functools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -23,7 +24,6 @@ import numpy as np
 from jaxtyping import Float32
 
 from octasplat.engine.core.errors import ConfigError, SceneFileError
-from octasplat.engine.core.local_origin import NO_ORIGIN, Origin, is_set
 from octasplat.engine.core.ply_container import (
     MAX_PROPERTIES,
     PlyElement,
@@ -37,6 +37,7 @@ from octasplat.engine.files.channel_columns import ChannelChoice, select_channel
 from octasplat.engine.files.encodings import MAX_SH_DEGREE, dropped_sh_message
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.octagon_recovery import is_octagon_ply
+from octasplat.engine.files.place_comments import parse_place, place_comments
 from octasplat.engine.files.ply_dialects import (
     UNUSED_SCALE_MESSAGE,
     has_unused_third_scale,
@@ -61,8 +62,8 @@ is axis 2. ``games`` (GaMeS, REdiSplats): the last two lie in the plane, the nor
 _FILTER = "filter_3D"
 """Standard deviation (world units) of the smoothing that Mip-Splatting and Gaussian Opacity Fields apply to
 each Gaussian before they show it."""
-ORIGIN_KEY = "origin_world"
-"""The comment that gives the origin of large coordinates; :class:`SceneMetadata` calls it so, too."""
+_NUMBERS = ("near_world", "pixel_rad", "turned_beyond")
+"""Those of :class:`SceneMetadata` that a comment of the same name gives."""
 _POSITION = ("x", "y", "z")
 _NORMAL = ("nx", "ny", "nz")
 _SH_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -115,42 +116,23 @@ def read_ply_metadata(path: Path) -> SceneMetadata:
     # Reversed, so that the first comment of a name counts
     metadata = dict(comment.partition(" ")[::2] for comment in reversed(read_ply_header(path).comments))
     known: dict[str, float] = {}
-    for field in fields(SceneMetadata):
-        if field.name == ORIGIN_KEY:
-            continue
-        if (value := metadata.get(field.name)) is None:
+    for name in _NUMBERS:
+        if (value := metadata.get(name)) is None:
             continue
         try:
-            known[field.name] = max(float(value), 0.0)
+            known[name] = max(float(value), 0.0)
         except ValueError:
-            raise SceneFileError(
-                f"{path}: its comment {field.name} is {value!r}, which is no number."
-            ) from None
-    facts = SceneMetadata(**known, origin_world=_parse_origin(path, metadata.get(ORIGIN_KEY)))
+            raise SceneFileError(f"{path}: its comment {name} is {value!r}, which is no number.") from None
+    origin, georeference = parse_place(path, metadata)
+    facts = SceneMetadata(**known, origin_world=origin, georeference=georeference)
     return replace(facts, turned_beyond=min(facts.turned_beyond, 1.0))  # it is a cosine
 
 
 def metadata_comments(facts: SceneMetadata) -> list[str]:
     """Return the comments of a PLY that say what is known of its scene as a whole."""
-    known = [f"{name} {value!r}" for name, value in asdict(facts).items() if name != ORIGIN_KEY and value > 0]
-    return [*known, *origin_comments(facts.origin_world)]
-
-
-def origin_comments(origin: Origin) -> list[str]:
-    """Return the comment of a text or a PLY that says where it has its origin, if that is not 0."""
-    return [f"{ORIGIN_KEY} {' '.join(map(repr, origin))}"] if is_set(origin) else []
-
-
-def _parse_origin(path: Path, text: str | None) -> Origin:
-    if text is None:
-        return NO_ORIGIN
-    try:
-        x, y, z = map(float, text.split())
-    except ValueError:
-        x = y = z = math.nan
-    if not all(map(math.isfinite, (x, y, z))):
-        raise SceneFileError(f"{path}: its comment {ORIGIN_KEY} is {text!r}, which is no point.") from None
-    return (x, y, z)
+    known = [(name, getattr(facts, name)) for name in _NUMBERS]
+    numbers = [f"{name} {value!r}" for name, value in known if value > 0]
+    return [*numbers, *place_comments(facts.origin_world, facts.georeference)]
 
 
 def _row_blocks(gaussians: FlatGaussians, degree: int, dtype: np.dtype[np.void]) -> Iterator[np.ndarray]:

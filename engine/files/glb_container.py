@@ -6,7 +6,7 @@ vertex attributes that they do not know or stop at the raw bytes.
 
 import json
 import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,10 +17,18 @@ from jaxtyping import Float64
 from numpy.typing import DTypeLike
 
 from octasplat.engine.core.errors import SceneFileError
-from octasplat.engine.core.local_origin import MAX_DISTANCE, NO_ORIGIN, Origin, is_set
+from octasplat.engine.core.local_origin import MAX_DISTANCE, NO_ORIGIN, Origin
 from octasplat.engine.core.writing import atomic_replace
+from octasplat.engine.files.glb_place import (
+    HALF_TURN_ABOUT_X,
+    ORIGIN_KEY,
+    TURN_KEY,
+    georeference_of_nodes,
+    rotation_of,
+)
 from octasplat.engine.gaussians.channels import column_names
 from octasplat.engine.gaussians.frames import quaternions_from_matrices, rotation_matrices
+from octasplat.engine.gaussians.scene_metadata import SceneMetadata
 
 MAX_BYTES = 2**32 - 1
 """A GLB states its length in 32 bits."""
@@ -29,8 +37,6 @@ ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
 UNSIGNED_BYTE, UNSIGNED_INT, FLOAT = 5121, 5125, 5126
 POINTS, TRIANGLES = 0, 4
 LINEAR, LINEAR_MIPMAP_LINEAR, CLAMP_TO_EDGE = 9729, 9987, 33071
-HALF_TURN_ABOUT_X = [1.0, 0.0, 0.0, 0.0]
-"""x, y, z, w, as glTF writes quaternions; brings COLMAP's frame (y down, z forward) to glTF's (y up)."""
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 CORE_NODE_NAME = "octasplat_cores"
@@ -39,10 +45,6 @@ MAX_CHUNKS = 64
 """The specification knows two; others are passed over."""
 MAX_PRIMITIVES = 100_000
 MAX_CHANNEL_COLUMNS = 10_000
-ORIGIN_KEY = "octasplat_origin"
-"""In the extras of a root node: the origin of large coordinates, which its translation adds."""
-TURN_KEY = "octasplat_turn"
-"""In the extras of a root node whose rotation (x, y, z, w) is another than the half turn about x."""
 CHANNELS = "octasplat_channels"
 GLB_READ_ERRORS = (KeyError, IndexError, TypeError, ValueError, AttributeError)
 """What reading a document that says nonsense may raise."""
@@ -211,44 +213,18 @@ class GlbFile:
         return local
 
 
-def read_glb_origin(path: Path) -> Origin:
-    """Return the local origin of the scene in a GLB.
+def read_glb_metadata(path: Path) -> SceneMetadata:
+    """Return the local origin and the georeference of the scene in a GLB.
 
     Raises:
         SceneFileError: the file is no GLB, or is damaged.
     """
     try:
-        return GlbFile(path).local_origin
+        file = GlbFile(path)
+        georeference = georeference_of_nodes(file.document.get("nodes", []))
+        return SceneMetadata(origin_world=file.local_origin, georeference=georeference)
     except GLB_READ_ERRORS as error:
         raise SceneFileError(f"{path}: its glTF is damaged or not understood ({error}).") from error
-
-
-def rotation_of(rotation_xyzw: Sequence[float]) -> Float64[np.ndarray, "3 3"]:
-    """Return the matrix of a quaternion as glTF writes it."""
-    x, y, z, w = rotation_xyzw
-    return np.asarray(rotation_matrices(np.array([[w, x, y, z]], np.float64))[0])
-
-
-def upright_root(rotation_xyzw: Sequence[float], origin: Origin) -> dict[str, object]:
-    """Return what a root node says that turns a scene upright: rotation, translation and extras."""
-    place = root_translation(origin, rotation_xyzw)
-    extras = {**dict(place.pop("extras", {})), TURN_KEY: list(rotation_xyzw)}  # type: ignore[call-overload]
-    return {"rotation": list(rotation_xyzw), **place, "extras": extras}
-
-
-def root_translation(origin: Origin, rotation_xyzw: Sequence[float] = HALF_TURN_ABOUT_X) -> dict[str, object]:
-    """Return what a root node says of a scene about a local origin; nothing where there is none.
-
-    Args:
-        origin: in our world frame.
-        rotation_xyzw: from our frame to glTF's.
-    """
-    if not is_set(origin):
-        return {}
-    return {
-        "translation": (rotation_of(rotation_xyzw) @ np.array(origin)).tolist(),
-        "extras": {ORIGIN_KEY: list(origin)},
-    }
 
 
 def _node_matrix(node: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:

@@ -10,6 +10,7 @@ from jaxtyping import UInt8
 from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.files import glb_container
 from octasplat.engine.files.glb_container import pad_to_four, write_glb
+from octasplat.engine.files.glb_place import HALF_TURN_ABOUT_X, root_place, upright_root
 from octasplat.engine.files.textures import png_bytes
 from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 
@@ -45,7 +46,7 @@ def write_surface(
     data = _SurfaceData()
     shading: dict[str, object] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
     material: dict[str, object] = {"name": "surface", "pbrMetallicRoughness": shading, "doubleSided": True}
-    node: dict[str, Any] = {"name": "surface", "rotation": glb_container.HALF_TURN_ABOUT_X, "mesh": 0}
+    node: dict[str, Any] = {"name": "surface", "rotation": HALF_TURN_ABOUT_X, "mesh": 0}
     document: dict[str, object] = {
         "asset": {"version": "2.0", "generator": "octasplat"},
         "scene": 0,
@@ -60,9 +61,9 @@ def write_surface(
         attributes["TANGENT"] = mesh.materials.tangents
         node["rotation"] = glb_container.light_rotation(mesh.materials.light_frame)
     if turn_xyzw is not None and mesh.materials is None:
-        node |= glb_container.upright_root(turn_xyzw, mesh.origin_world)
+        node |= upright_root(turn_xyzw, mesh.origin_world, mesh.georeference)
     else:
-        node |= glb_container.root_translation(mesh.origin_world, node["rotation"])
+        node |= root_place(mesh.origin_world, mesh.georeference, node["rotation"])
     if mesh.texture_srgb is not None and mesh.uv is not None:
         attributes["TEXCOORD_0"] = mesh.uv
         shading["baseColorTexture"] = data.texture("surface", mesh.texture_srgb)

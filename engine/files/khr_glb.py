@@ -17,7 +17,6 @@ from jaxtyping import Float32, Float64
 
 from octasplat.engine.core.color import linear_to_srgb, round_to_bytes, srgb_to_linear
 from octasplat.engine.core.errors import ConfigError, SceneFileError
-from octasplat.engine.core.local_origin import Origin
 from octasplat.engine.files import glb_container
 from octasplat.engine.files.channel_columns import ChannelChoice, select_channel_columns
 from octasplat.engine.files.encodings import (
@@ -32,6 +31,7 @@ from octasplat.engine.files.encodings import (
 )
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.glb_container import FLOAT, UNSIGNED_BYTE, GlbFile, pad_to_four, write_glb
+from octasplat.engine.files.glb_place import root_place
 from octasplat.engine.files.octagon_glb_reader import octagon_q, read_octagons
 from octasplat.engine.files.registry import Exporter, Importer, register
 from octasplat.engine.files.splat_rows import check_scales, iterate_blocks, select_for_export
@@ -40,6 +40,7 @@ from octasplat.engine.gaussians.flattening import GaussianCloud
 from octasplat.engine.gaussians.frames import quaternions_from_matrices, rotation_matrices
 from octasplat.engine.gaussians.model import FLAT_SCALE, SH_C0, FlatGaussians
 from octasplat.engine.gaussians.rows import concatenate_rows
+from octasplat.engine.gaussians.scene_metadata import SceneMetadata
 from octasplat.engine.gaussians.spherical_harmonics import rotate_sh
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -265,7 +266,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     scene = select_for_export(gaussians, path, options)
     check_scales(scene, path)
     layout = _file_attributes(scene.sh_degree, scene.channels.widths)
-    text = glb_container.json_bytes(_gltf_json(scene, layout, options.facts.origin_world))
+    text = glb_container.json_bytes(_gltf_json(scene, layout, options.facts))
     room = pad_to_four(len(text))
     length = len(scene) * sum(attribute.item_bytes for attribute in layout)
     total = glb_container.glb_size(room, length)
@@ -283,7 +284,9 @@ def _binary_blocks(scene: FlatGaussians, layout: tuple[_Attribute, ...]) -> Iter
             yield attribute.rows(block).astype(kind, copy=False).tobytes()
 
 
-def _gltf_json(scene: FlatGaussians, layout: tuple[_Attribute, ...], origin: Origin) -> dict[str, object]:
+def _gltf_json(
+    scene: FlatGaussians, layout: tuple[_Attribute, ...], facts: SceneMetadata
+) -> dict[str, object]:
     low, high = scene.means_world.min(axis=0), scene.means_world.max(axis=0)
     views: list[dict[str, object]] = []
     accessors: list[dict[str, object]] = []
@@ -321,7 +324,7 @@ def _gltf_json(scene: FlatGaussians, layout: tuple[_Attribute, ...], origin: Ori
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": "octasplat", "mesh": 0, **glb_container.root_translation(origin)}],
+        "nodes": [{"name": "octasplat", "mesh": 0, **root_place(facts.origin_world, facts.georeference)}],
         "meshes": [{"name": "gaussians", "primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": views,

@@ -4,7 +4,7 @@ Octagons: plain geometry for any program, with vertex colors, an MTL and the rad
 has no opacity per vertex, so the Gaussians' own opacities are lost; the texture keeps the fall-off.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,13 +13,12 @@ import numpy as np
 
 from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.core.errors import SceneFileError
-from octasplat.engine.core.local_origin import Origin
 from octasplat.engine.core.writing import atomic_replace, write_text
 from octasplat.engine.files.export_options import ExportOptions
-from octasplat.engine.files.gaussian_ply import origin_comments
 from octasplat.engine.files.obj_materials import read_mtl
 from octasplat.engine.files.obj_parser import ObjParts, parse_block, read_blocks, uv_of_vertices
 from octasplat.engine.files.octagon_batches import BATCH_SIZE, OctagonBatch, OctagonSoup
+from octasplat.engine.files.place_comments import place_comments
 from octasplat.engine.files.registry import Exporter, MeshReader, SurfaceWriter, register
 from octasplat.engine.files.textures import grey_png, png_bytes
 from octasplat.engine.gaussians.model import FlatGaussians
@@ -128,7 +127,9 @@ def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions)
         temporary.write_bytes(grey_png(options.falloff_texture_size, options.q))
     write_text(material, f"{_material_entry(MATERIAL)}map_d {texture.name}\n")
     with atomic_replace(path) as temporary, temporary.open("wb") as handle:
-        for text in _octagon_lines(soup, material.name, options.facts.origin_world):
+        for text in _octagon_lines(
+            soup, material.name, place_comments(options.facts.origin_world, options.facts.georeference)
+        ):
             handle.write(text.encode())
     return path, material, texture
 
@@ -137,15 +138,15 @@ def _material_entry(name: str) -> str:
     return f"newmtl {name}\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 0\n"
 
 
-def _origin_lines(origin: Origin) -> str:
-    return "".join(f"# {comment}\n" for comment in origin_comments(origin))
+def _comment_lines(comments: Sequence[str]) -> str:
+    return "".join(f"# {comment}\n" for comment in comments)
 
 
-def _octagon_lines(soup: OctagonSoup, material_name: str, origin: Origin) -> Iterator[str]:
+def _octagon_lines(soup: OctagonSoup, material_name: str, place: Sequence[str]) -> Iterator[str]:
     yield (
         f"# octasplat octagons: {SIDES} vertices and 6 triangles per Gaussian, in the order of the scene\n"
         f"# {Q_KEY} {soup.q!r}\n# {MIN_OPACITY_KEY} {soup.min_opacity!r}\n"
-        f"# {SCENE_SIZE_KEY} {soup.scene_size}\n{_origin_lines(origin)}"
+        f"# {SCENE_SIZE_KEY} {soup.scene_size}\n{_comment_lines(place)}"
         f"mtllib {material_name}\no octagons\nusemtl {MATERIAL}\n"
     )
     for batch in soup.batches():
@@ -176,7 +177,8 @@ def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
     Raises:
         OSError: a file cannot be written.
     """
-    head, files = f"# octasplat surface\n{_origin_lines(mesh.origin_world)}", [path]
+    place = place_comments(mesh.origin_world, mesh.georeference)
+    head, files = f"# octasplat surface\n{_comment_lines(place)}", [path]
     if mesh.texture_srgb is not None:
         material, image = _surface_files(path)
         with atomic_replace(image) as temporary:

@@ -21,8 +21,9 @@ from octasplat.engine.core.ply_container import (
     write_ply,
 )
 from octasplat.engine.files.export_options import ExportOptions
-from octasplat.engine.files.gaussian_ply import channel_comments, origin_comments
+from octasplat.engine.files.gaussian_ply import channel_comments
 from octasplat.engine.files.octagon_batches import BATCH_SIZE, OctagonSoup
+from octasplat.engine.files.place_comments import place_comments
 from octasplat.engine.files.registry import Exporter, MeshReader, SurfaceWriter, register
 from octasplat.engine.gaussians.channels import column_names
 from octasplat.engine.gaussians.model import FlatGaussians
@@ -153,7 +154,7 @@ def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions)
         f"{MIN_OPACITY_KEY} {options.min_opacity!r}",
         f"{SCENE_SIZE_KEY} {soup.scene_size}",
         *channel_comments(widths),
-        *origin_comments(options.facts.origin_world),
+        *place_comments(options.facts.origin_world, options.facts.georeference),
     )
     names = [column for name, width in widths.items() for column in column_names(name, width)]
     vertex = np.dtype([*VERTEX, *((name, "<f4") for name in names)])
@@ -205,7 +206,8 @@ def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
             rows[name] = to_bytes(mesh.rgb_srgb[:, column])
     vertices = PlyWriteElement("vertex", len(rows), rows.dtype, [rows])
     faces = PlyWriteElement("face", len(mesh.faces), FACE, [_face_rows(mesh.faces)])
-    write_ply(path, [vertices, faces], ["octasplat surface", *origin_comments(mesh.origin_world)])
+    place = place_comments(mesh.origin_world, mesh.georeference)
+    write_ply(path, [vertices, faces], ["octasplat surface", *place])
     return (path,)
 
 

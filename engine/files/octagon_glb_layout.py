@@ -12,7 +12,6 @@ from octasplat.engine.files.glb_container import (
     CORE_NODE_NAME,
     ELEMENT_ARRAY_BUFFER,
     FLOAT,
-    HALF_TURN_ABOUT_X,
     LINEAR,
     UNSIGNED_INT,
     ChannelAttribute,
@@ -21,10 +20,9 @@ from octasplat.engine.files.glb_container import (
     json_bytes,
     light_rotation,
     pad_to_four,
-    root_translation,
-    upright_root,
     vector_type,
 )
+from octasplat.engine.files.glb_place import HALF_TURN_ABOUT_X, root_place, upright_root
 from octasplat.engine.gaussians.octagon import FAN_TRIANGLES, SIDES
 from octasplat.engine.shading.environment_frame import environment_frame
 
@@ -134,7 +132,7 @@ class GlbLayout:
             solid = {**blended, "material": 1, "extras": {CORE_NODE_NAME: True}}
             meshes.append({"primitives": [blended] if self._options.cores is None else [solid, blended]})
         chunks = range(len(self._chunk_sizes))
-        lit = self._options.light_up is not None
+        lit, facts = self._options.light_up is not None, self._options.facts
         turn = (
             light_rotation(environment_frame(np.array(self._options.light_up))) if lit else HALF_TURN_ABOUT_X
         )
@@ -148,9 +146,9 @@ class GlbLayout:
                 "rotation": turn,
                 "children": [1 + chunk for chunk in chunks],
                 **(
-                    root_translation(self._options.facts.origin_world, turn)
+                    root_place(facts.origin_world, facts.georeference, turn)
                     if self._options.turn_xyzw is None
-                    else upright_root(self._options.turn_xyzw, self._options.facts.origin_world)
+                    else upright_root(self._options.turn_xyzw, facts.origin_world, facts.georeference)
                 ),
             },
             *({"name": f"octagons_{chunk:02d}", "mesh": chunk} for chunk in chunks),

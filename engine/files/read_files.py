@@ -1,15 +1,17 @@
 """Scenes and meshes read from files of any known format."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.core.events import EventListener, ignore_events
+from octasplat.engine.core.georeference import GEOREFERENCE_FILE, read_georeference
 from octasplat.engine.core.progress import phase
 from octasplat.engine.files.channel_columns import ChannelChoice
 from octasplat.engine.files.gaussian_ply import read_ply_metadata
-from octasplat.engine.files.glb_container import read_glb_origin
+from octasplat.engine.files.glb_container import read_glb_metadata
 from octasplat.engine.files.registry import importer_for, mesh_reader_for
 from octasplat.engine.gaussians.flattening import ImportReport, flatten
 from octasplat.engine.gaussians.model import FlatGaussians
@@ -57,15 +59,22 @@ def read_scene(
 
 
 def read_metadata(path: Path) -> SceneMetadata:
-    """Return the metadata that a file or a run's scene states: our PLY all, a GLB its origin, others none.
+    """Return the metadata that a file or a run's scene states: our PLY all, a GLB its place, others none.
+
+    The georeference of a run's scene is in a file beside it, see :mod:`octasplat.engine.core.georeference`.
 
     Raises:
         SceneFileError: the file cannot be read or is damaged.
+        ConfigError: the georeference beside it cannot be read.
     """
     source = _scene_file(path)
     if source.suffix.lower() == ".glb":
-        return SceneMetadata(origin_world=read_glb_origin(source))
-    return read_ply_metadata(source) if source.suffix.lower() == ".ply" else UNKNOWN_METADATA
+        return read_glb_metadata(source)
+    facts = read_ply_metadata(source) if source.suffix.lower() == ".ply" else UNKNOWN_METADATA
+    if source.name == FOLDER_FILES[0]:
+        beside = read_georeference(source.with_name(GEOREFERENCE_FILE))
+        return facts if beside is None else replace(facts, georeference=beside)
+    return facts
 
 
 def read_mesh(path: Path, *, with_materials: bool = False) -> ImportedMesh:

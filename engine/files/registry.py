@@ -63,7 +63,7 @@ class Exporter(Entry):
             or None.
         holds_channels: whether it writes named channels, too.
         holds_harmonics: whether colors may change with the direction.
-        holds_origin: whether it says where a scene of large coordinates has its origin.
+        holds_origin: whether it says where a scene of large coordinates has its origin, and its georeference.
         beside: names the files that are written beside the path, if there are any.
         find_losses: returns what of a scene lies beyond the ranges of the format, one sentence a loss.
     """

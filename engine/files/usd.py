@@ -16,6 +16,7 @@ import numpy as np
 
 from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.core.georeference import Georeference
 from octasplat.engine.core.local_origin import Origin, is_set
 from octasplat.engine.core.writing import atomic_replace
 from octasplat.engine.files.encodings import half_turn_gaussians, unit_quats
@@ -24,10 +25,13 @@ from octasplat.engine.files.registry import Exporter, register
 from octasplat.engine.files.splat_rows import check_scales, select_for_export
 from octasplat.engine.gaussians.flattening import rotate_axis_to_first
 from octasplat.engine.gaussians.model import FLAT_SCALE, FlatGaussians
+from octasplat.engine.gaussians.scene_metadata import SceneMetadata
 
 ROOT, FIELD = "/octasplat", "/octasplat/gaussians"
 COLOR_SPACE = "srgb_rec709_scene"
 EXTENT_SIGMAS = 3.0
+EAST_UP_SOUTH = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""From x east, y north and z up to y up."""
 SCHEMAS = (
     "ParticleFieldPositionAttributeAPI",
     "ParticleFieldOrientationAttributeAPI",
@@ -51,7 +55,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     suffix = ".usdc" if path.suffix.lower() in (".usdz", ".usd") else path.suffix.lower()
     with tempfile.TemporaryDirectory(prefix="octasplat-") as folder, atomic_replace(path) as temporary:
         layer = Path(folder) / f"scene{suffix}"
-        _write_stage(pxr, scene, layer, options.facts.origin_world)
+        _write_stage(pxr, scene, layer, options.facts)
         if path.suffix.lower() == ".usdz":
             package = Path(folder) / "scene.usdz"
             if not pxr["UsdUtils"].CreateNewUsdzPackage(pxr["Sdf"].AssetPath(str(layer)), str(package)):
@@ -78,12 +82,13 @@ def missing_usd() -> str | None:
 
 def _import_usd(path: Path) -> dict[str, ModuleType]:
     try:
-        from pxr import Sdf, Usd, UsdGeom, UsdUtils, UsdVol, Vt
+        from pxr import Gf, Sdf, Usd, UsdGeom, UsdUtils, UsdVol, Vt
     except ImportError as error:
         raise SceneFileError(f"{path}: {missing_usd() or error}.") from error
     if not hasattr(UsdVol, "ParticleField"):
         raise SceneFileError(f"{path}: this usd-core has no ParticleField; install usd-core 26.5 or later.")
     return {
+        "Gf": Gf,
         "Sdf": Sdf,
         "Usd": Usd,
         "UsdGeom": UsdGeom,
@@ -93,15 +98,19 @@ def _import_usd(path: Path) -> dict[str, ModuleType]:
     }
 
 
-def _write_stage(pxr: dict[str, ModuleType], scene: FlatGaussians, layer: Path, origin: Origin) -> None:
+def _write_stage(pxr: dict[str, ModuleType], scene: FlatGaussians, layer: Path, facts: SceneMetadata) -> None:
     usd, geom, vol, vt = (pxr[name] for name in ("Usd", "UsdGeom", "UsdVol", "Vt"))
     stage = usd.Stage.CreateNew(str(layer))
     geom.SetStageUpAxis(stage, geom.Tokens.y)
-    geom.SetStageMetersPerUnit(stage, 1.0)
     root = geom.Xform.Define(stage, ROOT)
-    if is_set(origin):
-        x, y, z = origin
-        root.AddTranslateOp(geom.XformOp.PrecisionDouble).Set((x, -y, -z))  # turned to y up, as the data are
+    if facts.georeference is not None:
+        _place_in_georeference(pxr, stage, root, facts.georeference, facts.origin_world)
+    else:
+        geom.SetStageMetersPerUnit(stage, 1.0)
+        if is_set(facts.origin_world):
+            x, y, z = facts.origin_world
+            # turned to y up, as the data are
+            root.AddTranslateOp(geom.XformOp.PrecisionDouble).Set((x, -y, -z))
     stage.SetDefaultPrim(root.GetPrim())
     prim = vol.ParticleField.Define(stage, FIELD).GetPrim()
     for schema in SCHEMAS:
@@ -136,6 +145,29 @@ def _write_stage(pxr: dict[str, ModuleType], scene: FlatGaussians, layer: Path, 
         primvar.Set(vt.FloatArray.FromNumpy(np.ascontiguousarray(values).reshape(-1)))
     prim.GetAttribute("primvars:displayColor").SetColorSpace("lin_rec709_scene")
     stage.GetRootLayer().Save()
+
+
+def _place_in_georeference(
+    pxr: dict[str, ModuleType], stage: Any, root: Any, georeference: Georeference, origin: Origin
+) -> None:
+    """Put the root where it lies about the anchor, x east, y up and z south, in units of the scene.
+
+    How many metres a unit is, and where the anchor is, stand in the metadata of the stage.
+    """
+    scale = georeference.metres_per_unit
+    pxr["UsdGeom"].SetStageMetersPerUnit(stage, scale)
+    shift, data = np.eye(4), np.diag([1.0, -1.0, -1.0, 1.0])
+    shift[:3, 3] = origin
+    placed = georeference.metres_from_scene @ shift @ data  # of the data, which are turned by half about x
+    placed[:3] /= scale
+    placed = EAST_UP_SOUTH @ placed
+    # USD multiplies row vectors
+    root.AddTransformOp(pxr["UsdGeom"].XformOp.PrecisionDouble).Set(pxr["Gf"].Matrix4d(*placed.T.ravel()))
+    known: dict[str, object] = {"axes": "x east, y up, z south, in units of metersPerUnit"}
+    if georeference.anchor is not None:
+        known |= {"crs": georeference.crs, "anchor": list(georeference.anchor)}
+    layer = stage.GetRootLayer()
+    layer.customLayerData = {"octasplat_georeference": known}
 
 
 register(

@@ -73,6 +73,11 @@ def dropped_on_export(
             f"{_format_list_text(without, 'has', 'have')} no place for the origin of large coordinates; add "
             f"{describe_origin(facts.origin_world)} to its positions."
         )
+    if facts.georeference is not None and without:
+        lines.append(
+            f"{_format_list_text(without, 'has', 'have')} no place for the georeference: "
+            f"{facts.georeference.describe()}."
+        )
     for exporter in chosen.values():
         lines += exporter.find_losses(gaussians)
     return tuple(lines)

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from octasplat.engine.core.georeference import Georeference
 from octasplat.engine.core.local_origin import NO_ORIGIN, Origin
 from octasplat.engine.gaussians.materials import ALBEDO
 from octasplat.engine.gaussians.model import FlatGaussians
@@ -19,12 +20,14 @@ class SceneMetadata:
             normals have no side. Files have it by this name.
         origin_world: where the scene has its origin in the coordinates of its user, see
             :mod:`octasplat.engine.core.local_origin`.
+        georeference: where it lies on the Earth, and how large it is; None where that is not known.
     """
 
     near_world: float = 0.0
     pixel_rad: float = 0.0
     turned_beyond: float = 0.0
     origin_world: Origin = NO_ORIGIN
+    georeference: Georeference | None = None
 
     def scaled(self, factor: float) -> "SceneMetadata":
         """Return the metadata of the scene scaled by ``factor``."""
@@ -37,12 +40,15 @@ UNKNOWN_METADATA = SceneMetadata()
 def merge_metadata(scenes: Sequence[tuple[FlatGaussians, SceneMetadata]]) -> SceneMetadata:
     """Return the metadata of merged scenes: what holds for each of them, about the origin of the first.
 
-    Whether normals have a side is for those to say that have materials, as no others are lit by them.
+    Scenes are put together as they stand, so that a georeference holds if no scene has another. Whether
+    normals have a side is for those to say that have materials, as no others are lit by them.
     """
+    places = {facts.georeference for _, facts in scenes if facts.georeference is not None}
     lit = [facts.turned_beyond for gaussians, facts in scenes if ALBEDO in gaussians.channels]
     return SceneMetadata(
         near_world=min(facts.near_world for _, facts in scenes),
         pixel_rad=min(facts.pixel_rad for _, facts in scenes),
         turned_beyond=min(lit, default=0.0),
         origin_world=scenes[0][1].origin_world,
+        georeference=next(iter(places)) if len(places) == 1 else None,
     )

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8
 
+from octasplat.engine.core.georeference import Georeference
 from octasplat.engine.core.local_origin import NO_ORIGIN, Origin
 
 
@@ -43,6 +44,7 @@ class TriangleMesh:
         materials: how it is to be lit; None where its colors have their light in them.
         origin_world: where the mesh has its origin in the coordinates of its user, see
             :mod:`octasplat.engine.core.local_origin`.
+        georeference: where it lies on the Earth, and how large it is; None where that is not known.
     """
 
     vertices_world: Float32[np.ndarray, "n 3"]
@@ -53,6 +55,7 @@ class TriangleMesh:
     normals_world: Float32[np.ndarray, "n 3"] | None = None
     materials: MaterialMaps | None = None
     origin_world: Origin = NO_ORIGIN
+    georeference: Georeference | None = None
 
     @property
     def face_corners_world(self) -> Float64[np.ndarray, "m 3 3"]:

@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import Field, InstanceOf
 
 from octasplat.engine.core.events import EventListener, ignore_events
+from octasplat.engine.core.georeference import Georeference
 from octasplat.engine.core.local_origin import NO_ORIGIN, describe_origin, is_set, user_position
 from octasplat.engine.evaluate.scene_statistics import (
     OPACITY_EDGES,
@@ -67,6 +68,7 @@ class InfoResult(Result):
         photographs: how many the run was made from; None of a file.
         up_world: the direction that points up; known of a run, a guess of a file.
         origin_world: where the scene has its origin; positions of ``scene`` are about it.
+        georeference: where the scene lies and how large it is; None where that is not known.
         scene: counts, bounds and sizes of the Gaussians.
         hits: how many Gaussians the rays of the picture meet; None where none was traced.
         picture_srgb: the scene from the place of the run's first photograph, or from a turntable; display
@@ -78,6 +80,7 @@ class InfoResult(Result):
     photographs: int | None
     up_world: tuple[float, float, float]
     origin_world: tuple[float, float, float] = NO_ORIGIN
+    georeference: Georeference | None = None
     scene: InstanceOf[SceneStatistics]
     hits: InstanceOf[HitStatistics] | None = None
     picture_srgb: InstanceOf[np.ndarray] | None = Field(None, repr=False)
@@ -95,6 +98,11 @@ class InfoResult(Result):
             "photographs": self.photographs,
             "up_world": list(self.up_world),
             **({"origin_world": list(self.origin_world)} if is_set(self.origin_world) else {}),
+            **(
+                {}
+                if self.georeference is None
+                else {"georeference": self.georeference.model_dump(mode="json")}
+            ),
             **scene,
             "opacity_edges": OPACITY_EDGES,
             "scale_quantiles_of": QUANTILES,
@@ -120,6 +128,7 @@ class InfoResult(Result):
             + (f", channels {channels}" if channels else ""),
             f"  up          {_format_vector(self.up_world)} ({up})",
             *((f"  origin      {describe_origin(origin)} (of what files hold)",) if is_set(origin) else ()),
+            *(() if self.georeference is None else (f"  place       {self.georeference.describe()}",)),
             f"  centres     {place(box.low_world)} to {place(box.high_world)}",
             f"  solid part  {place(solid.low_world)} to {place(solid.high_world)}",
             f"  seen        around {place(scene.seen.centre_world)}, "
@@ -176,6 +185,7 @@ def run(
     found = inspect_scene(opened, up)
     traced = trace_picture(opened, up) if request.rays or request.picture is not None else None
     x, y, z = found.up_world.tolist()
+    known = read_metadata(source)
     result = InfoResult(
         files=files,
         folder=None if request.output is None else request.output.parent,
@@ -183,7 +193,8 @@ def run(
         size_bytes=source.stat().st_size if source.is_file() else None,
         photographs=found.photographs,
         up_world=(x, y, z),
-        origin_world=read_metadata(source).origin_world,
+        origin_world=known.origin_world,
+        georeference=known.georeference,
         scene=found.scene,
         hits=None if traced is None else traced.hits,
         picture_srgb=None if traced is None else traced.rgb_srgb,

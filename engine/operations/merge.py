@@ -91,6 +91,9 @@ def run(
         if missing := ", ".join(name for name in every if name not in scene.channels):
             emit_warning(progress, f"{source}: has no channel {missing}; it is 0 there.")
     merged = merge_scenes(scenes, request.sh_degree)
+    merged_facts = merge_metadata(list(zip(scenes, facts, strict=True)))
+    if merged_facts.georeference is None and any(each.georeference is not None for each in facts):
+        emit_warning(progress, "The scenes have different georeferences; the merged scene has none.")
     stop_if(should_stop)
     written = write_edited_scene(
         first,
@@ -98,7 +101,7 @@ def run(
         request.output,
         progress,
         edit_record=describe_edit("merge", options_of(MergeOptions, request), gaussians=len(merged)),
-        facts=merge_metadata(list(zip(scenes, facts, strict=True))),
+        facts=merged_facts,
     )
     return MergeResult(
         files=written.files, folder=written.folder, notes=(written.sentence,), counts=tuple(map(len, scenes))

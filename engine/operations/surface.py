@@ -252,7 +252,7 @@ def run(
         raise OutputError(
             f"{source} holds no {SCENE} yet; finish the run with octasplat reconstruct --resume."
         )
-    gaussians, origin = open_scene(source, progress), read_metadata(source).origin_world
+    gaussians, facts = open_scene(source, progress), read_metadata(source)
     features, frame, light = None, None, None
     if request.materials:
         require_materials(gaussians, source / SCENE if is_run(source) else source)
@@ -270,7 +270,7 @@ def run(
         tracer,
         cameras,
         # bounds are given in the user's coordinates
-        request.model_copy(update={"bounds": box_about(request.bounds, origin)}),
+        request.model_copy(update={"bounds": box_about(request.bounds, facts.origin_world)}),
         tuple(request.levels.values()) or (None,),
         scratch=output.parent,
         light_frame=frame,
@@ -278,9 +278,10 @@ def run(
         listener=progress,
         should_stop=should_stop,
     )
+    place: dict[str, Any] = {"origin_world": facts.origin_world, "georeference": facts.georeference}
     levels = tuple(
-        _surface_level(surface, write_surface(replace(surface.mesh, origin_world=origin), place))
-        for surface, place in zip(surfaces, request.outputs, strict=True)
+        _surface_level(surface, write_surface(replace(surface.mesh, **place), path))
+        for surface, path in zip(surfaces, request.outputs, strict=True)
     )
     environment = None if light is None else _copy_light(light, output)
     files = (*(path for level in levels for path in level.files), *([environment] if environment else []))

@@ -10,12 +10,15 @@ from jaxtyping import Float64
 from pydantic import Field, FiniteFloat, model_validator
 
 from octasplat.engine.core.events import EventListener, ignore_events
+from octasplat.engine.core.georeference import Georeference
+from octasplat.engine.gaussians.scene_metadata import SceneMetadata
 from octasplat.engine.operations.axes import Axis
 from octasplat.engine.operations.base import (
     Operation,
     Options,
     SceneRequest,
     ScenesWritten,
+    emit_warning,
     never_stop,
     options_of,
     stop_if,
@@ -141,12 +144,31 @@ def run(
             "world_map": rows,
         },
         # distances scale with the world, the origin is that after the map
-        facts=replace(facts.scaled(mean_scale(matrix)), origin_world=origin),
+        facts=replace(
+            facts.scaled(mean_scale(matrix)),
+            origin_world=origin,
+            georeference=_moved(facts, matrix, progress),
+        ),
         matrix=local,
     )
     return TransformResult(
         files=written.files, folder=written.folder, notes=(written.sentence,), matrix=rows, count=len(moved)
     )
+
+
+def _moved(
+    facts: SceneMetadata, matrix: Float64[np.ndarray, "4 4"], progress: EventListener
+) -> Georeference | None:
+    """Return the georeference of a scene after a map of it; a warning says where it is lost."""
+    if facts.georeference is None:
+        return None
+    moved = facts.georeference.after(matrix)
+    if moved is None:
+        emit_warning(
+            progress,
+            "The georeference is left out, as the scene was mirrored, sheared or scaled unevenly.",
+        )
+    return moved
 
 
 OPERATION = Operation("transform", "Move, turn or scale a scene.", TransformRequest, TransformOptions, run)

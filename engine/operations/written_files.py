@@ -35,7 +35,7 @@ _UNCHANGED_SINCE = dict[str, tuple[int, int]]
 _DATASET_FOLDERS = ("images", "masks", "sparse", "colmap")
 _RUN_FILES = (
     "config.json", "events.jsonl", "held_out.json", "views.json", "training.json", "plan.json", "scene.ply",
-    "edits.json", "environment.hdr", "environment.exr", "background.exr",
+    "edits.json", "environment.hdr", "environment.exr", "background.exr", "georeference.json",
 )  # fmt: skip
 _RUN_FOLDERS = ("cache", "checkpoints", "poses")
 

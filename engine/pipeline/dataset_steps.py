@@ -1,9 +1,12 @@
 """Steps before the training: pose search, and opening of the dataset."""
 
-from octasplat.engine.core.events import Warned
+from octasplat.engine.core.events import Noted, Warned
+from octasplat.engine.core.georeference import GEOREFERENCE_FILE, write_georeference
 from octasplat.engine.core.progress import phase
 from octasplat.engine.dataset import Dataset, write_held_out
 from octasplat.engine.dataset.views_file import write_views
+from octasplat.engine.georeference.find_georeference import find_georeference
+from octasplat.engine.georeference.request import read_request
 from octasplat.engine.pipeline.output_folder import write_config
 from octasplat.engine.pipeline.run import ReconstructionRun
 from octasplat.engine.pipeline.start_scene import check_start, has_start
@@ -32,7 +35,11 @@ class FindPoses:
 
     def __call__(self, run: ReconstructionRun) -> None:
         """Find the poses; a new run says first which files it leaves out."""
+        config = run.config
         if run.recorded is None:
+            run.georeference = read_request(
+                run.scene, config.georeference, config.control_points, config.known_length
+            )
             for sentence in notes_on_files(run.scene):
                 run.progress(Warned(sentence))
         find_missing_poses(
@@ -62,6 +69,7 @@ class OpenDataset:
             _repair_poses(run)
             if has_start(output):
                 check_start(output, run.dataset, run.config.train, run.progress)
+            _find_georeference(run)
             write_views(output / VIEWS, run.dataset.views_record)
         held_out = [run.dataset.views[i].name for i in run.dataset.test_indices]
         write_held_out(output / HELD_OUT, held_out)
@@ -83,6 +91,15 @@ def _repair_poses(run: ReconstructionRun) -> None:
         run.dataset = _load_dataset(run)
     if estimate_principal_points(run.dataset, run.output, run.config, run.progress, run.should_stop):
         run.dataset = _load_dataset(run)
+
+
+def _find_georeference(run: ReconstructionRun) -> None:
+    """Write where the scene of a new run lies, if that is known."""
+    if run.georeference is None:
+        return
+    found = find_georeference(run.dataset, run.georeference, lambda text: run.progress(Noted(text)))
+    if found is not None:
+        write_georeference(run.output / GEOREFERENCE_FILE, found)
 
 
 def _load_dataset(run: ReconstructionRun) -> Dataset:

@@ -11,6 +11,7 @@ from octasplat.engine.core.events import EventListener
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.dataset.views_file import ViewsRecord
 from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.georeference.request import GeoreferenceRequest
 from octasplat.engine.pipeline.block_request import BlockRequest
 from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.shading.protocol import ShadingModel
@@ -35,6 +36,7 @@ class ReconstructionRun:
         recorded: the photographs of a run that goes on; None for a new one.
         blocks: how to train in blocks; None trains the scene as a whole.
         check_views: called with the photographs that were found, before decoding; raises to reject them.
+        georeference: what the georeference of a new run is found from.
     """
 
     scene: Path
@@ -47,6 +49,7 @@ class ReconstructionRun:
     recorded: ViewsRecord | None = None
     blocks: BlockRequest | None = None
     check_views: Callable[[ViewsRecord], None] | None = None
+    georeference: GeoreferenceRequest | None = None
     _dataset: Dataset | None = None
 
     @property

@@ -74,6 +74,26 @@ class RunSettings(BaseModel):
         description="What lies behind renders and photographs with alpha when they are compared; by default "
         "that of the training: white where train.background is white, else black.",
     )
+    georeference: Annotated[Literal["auto", "gps", "off"], BASIC] = Field(
+        "auto",
+        description="What says where the scene lies, how large it is, and what is up: auto takes control "
+        "points, else the GPS positions in the photographs where they agree with the scene; gps refuses the "
+        "photographs where these do not; off looks for nothing, so that no file says where the photographs "
+        "were taken.",
+    )
+    control_points: Annotated[str | None, Spelling(metavar="FILE"), ADVANCED] = Field(
+        None,
+        min_length=1,
+        description="A file of ground control points in the folder of the photographs: gcp_list.txt as "
+        "OpenDroneMap has it, or a CSV with name,x,y,z,photograph,px,py; by default gcp_list.txt or "
+        "control_points.csv where there is one.",
+    )
+    known_length: Annotated[str | None, Spelling(metavar="'A B METRES'"), ADVANCED] = Field(
+        None,
+        min_length=5,
+        description="Two points and the metres between them, which decide the scale; a point is a control "
+        "point, a photograph, the number of a sparse point, or x,y,z.",
+    )
     minutes: Annotated[float | None, Unit("minutes"), BASIC] = Field(
         None,
         ge=0.1,

@@ -61,7 +61,8 @@ def small_surface(
             photographs=None,
             listener=lambda _event: on_pass(),
         )
-        return replace(found.mesh, origin_world=read_metadata(source).origin_world)
+        facts = read_metadata(source)
+        return replace(found.mesh, origin_world=facts.origin_world, georeference=facts.georeference)
 
     try:
         return extract(OPTIONS)

@@ -90,7 +90,7 @@ def check_file_content(
         IntakeError: the header is refused, or the file was cut off.
         StorageError: the content cannot be had.
     """
-    if file_role(name) is FileRole.MODEL:
+    if file_role(name) in (FileRole.MODEL, FileRole.CONTROL):
         return None
     with storage.open(sha256) as file:
         header = read_image_header(file, name, limits)
@@ -185,7 +185,7 @@ def _image_sizes(
 ) -> dict[str, tuple[int, int]]:
     sizes: dict[str, tuple[int, int]] = {}
     for file in files:
-        if file_role(file.path) is FileRole.MODEL:
+        if file_role(file.path) in (FileRole.MODEL, FileRole.CONTROL):
             continue
         if file.width_px is not None and file.height_px is not None:
             sizes[file.path] = file.width_px, file.height_px

@@ -240,6 +240,7 @@ _USE_BY_NAME = {
     "background.exr": (_SCENE, "Blender and whatever takes EXR maps: the sky, and what else is far away"),
     "edits.json": (_RECORDS, "a text editor: what was changed since the training"),
     "views.json": (_RECORDS, "octasplat render and surface, which need no photographs then"),
+    "georeference.json": (_RECORDS, "a text editor: where the scene lies, how large it is, and what is up"),
     "events.jsonl": (_RECORDS, "a text editor: what happened when, a line each"),
     "training.json": (_RECORDS, "a text editor"),
     "plan.json": (_RECORDS, "a text editor: what the time for the training was used for"),

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from octasplat.engine.core.georeference import GEOREFERENCE_FILE
 from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.base import Options
 from octasplat.engine.operations.clean import OPERATION as CLEAN
@@ -157,7 +158,10 @@ def register_builtin_kinds() -> None:
             EVALUATE,
             title="Measure views of a reconstruction: those held out again, or other photographs",
             stages=("evaluate",),
-            source_files=(*RUN_FILES, LIGHT_FILE, EXACT_LIGHT_FILE, BACKGROUND_FILE, EDITS_FILE),
+            source_files=(
+                *RUN_FILES,
+                *(LIGHT_FILE, EXACT_LIGHT_FILE, BACKGROUND_FILE, EDITS_FILE, GEOREFERENCE_FILE),
+            ),
             reports_stages=True,
         )
     )
@@ -195,7 +199,7 @@ def register_builtin_kinds() -> None:
             INFO,
             title="What is in the scene of a reconstruction: counts, bounds, sizes, cost",
             stages=("read",),
-            source_files=(*RUN_FILES[:4], BACKGROUND_FILE),
+            source_files=(*RUN_FILES[:4], BACKGROUND_FILE, GEOREFERENCE_FILE),
         )
     )
     register(SurfaceKind())

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+from octasplat.engine.core.georeference import GEOREFERENCE_FILE
 from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.base import Operation, Options
 from octasplat.engine.operations.export import OPERATION as EXPORT
@@ -32,7 +33,7 @@ class ExportKind(OperationKind):
             EXPORT,
             title="The scene of a reconstruction in other formats",
             stages=("export",),
-            source_files=(SCENE_FILE, CONFIG_FILE, "views.json"),
+            source_files=(SCENE_FILE, CONFIG_FILE, "views.json", GEOREFERENCE_FILE),
         )
 
     def request_paths(self, task: Task, options: Any) -> dict[str, Any]:
@@ -83,7 +84,8 @@ class SceneEditKind(OperationKind):
         keeps_world_frame: bool = True,
     ) -> None:
         files = dict.fromkeys(
-            (required_file, *RUN_FILES, LIGHT_FILE, EXACT_LIGHT_FILE, BACKGROUND_FILE, EDITS_FILE)
+            (required_file, *RUN_FILES, LIGHT_FILE, EXACT_LIGHT_FILE, BACKGROUND_FILE)
+            + (EDITS_FILE, GEOREFERENCE_FILE)
         )
         super().__init__(operation, title=title, stages=("edit",), source_files=tuple(files))
         self.keeps_world_frame = keeps_world_frame

@@ -48,7 +48,7 @@ class SurfaceKind(OperationKind):
             stages=("depth", "fusing", "meshing"),
             source_files=(
                 *("scene.ply", "config.json", "held_out.json", "views.json", "training.json"),
-                "environment.hdr",
+                *("environment.hdr", "georeference.json"),
             ),
             reports_stages=True,
         )

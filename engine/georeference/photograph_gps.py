@@ -1,0 +1,49 @@
+"""Positions that cameras wrote into their photographs, in EXIF."""
+
+import math
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from PIL import ExifTags, Image
+
+GpsPosition = tuple[float, float, float]
+"""Latitude and longitude in degrees, and height in metres."""
+
+
+def read_gps(path: Path) -> GpsPosition | None:
+    """Return the GPS position in the EXIF of a photograph; None where there is none, or none with a height.
+
+    A position of exactly 0, 0 is what cameras write that know none.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # damaged EXIF, or many pixels, none of which are decoded
+            with Image.open(path) as image:
+                tags = image.getexif().get_ifd(ExifTags.IFD.GPSInfo)
+        latitude = _degrees(tags[ExifTags.GPS.GPSLatitude], tags[ExifTags.GPS.GPSLatitudeRef], "SN")
+        longitude = _degrees(tags[ExifTags.GPS.GPSLongitude], tags[ExifTags.GPS.GPSLongitudeRef], "WE")
+        height = float(tags[ExifTags.GPS.GPSAltitude])
+    except (
+        OSError,
+        KeyError,
+        TypeError,
+        ValueError,
+        ZeroDivisionError,
+        SyntaxError,
+        Image.DecompressionBombError,
+    ):
+        return None
+    if tags.get(ExifTags.GPS.GPSAltitudeRef, b"\0") in (1, b"\1"):
+        height = -height  # below the sea
+    if not (abs(latitude) <= 90 and abs(longitude) <= 180 and math.isfinite(height)):
+        return None
+    return None if latitude == longitude == 0 else (latitude, longitude, height)
+
+
+def _degrees(parts: Sequence[Any], letter: str, letters: str) -> float:
+    """Return an angle of degrees, minutes and seconds; ``letters`` are the negative and the positive one."""
+    degrees, minutes, seconds = (float(part) for part in parts)
+    sign = (-1.0, 1.0)[letters.index(letter.strip("\0 ").upper())]
+    return sign * (degrees + minutes / 60 + seconds / 3600)
