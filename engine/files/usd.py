@@ -165,7 +165,7 @@ def _place_in_georeference(
     root.AddTransformOp(pxr["UsdGeom"].XformOp.PrecisionDouble).Set(pxr["Gf"].Matrix4d(*placed.T.ravel()))
     known: dict[str, object] = {"axes": "x east, y up, z south, in units of metersPerUnit"}
     if georeference.anchor is not None:
-        known |= {"crs": georeference.crs, "anchor": list(georeference.anchor)}
+        known |= {"crs": georeference.crs, "anchor": pxr["Gf"].Vec3d(*georeference.anchor)}
     layer = stage.GetRootLayer()
     layer.customLayerData = {"octasplat_georeference": known}
 

@@ -6,8 +6,8 @@ Two forms are read, told apart by their content:
 ``x y z px py photograph name``, apart by blanks or tabs.
 
 A CSV with a line of names: ``name,x,y,z,photograph,px,py``, a row for each sighting; a comment
-``# EPSG:32632`` says the coordinate system. A row without a photograph is one of a photograph (its camera's position) or of a
-sparse point (its number), by ``name``. Points without ``x,y,z`` are there for known lengths.
+``# EPSG:32632`` says the coordinate system. A row without a photograph is one of a photograph (its camera's
+position) or of a sparse point (its number), by ``name``. Points without ``x,y,z`` are for known lengths.
 """
 
 import csv

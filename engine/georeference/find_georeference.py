@@ -109,7 +109,7 @@ def _from_control_points(
         position = points.control_position(point)
         if position is None:
             note(
-                f"{control.path}: {point.name} is left out; fewer than two photographs that show it have poses."
+                f"{control.path}: {point.name} is left out, as fewer than two of its photographs have poses."
             )
             continue
         names.append(point.name)

@@ -90,7 +90,7 @@ def fit_similarity(
     found = pycolmap.estimate_sim3d_robust(source, target, options)
     if found is None:
         raise SimilarityError("contradict each other")
-    used = _distances(found.matrix(), source, target) <= options.max_error
+    used = _distances(found["tgt_from_src"].matrix(), source, target) <= options.max_error
     for _ in range(10):
         if used.sum() < max(MIN_POSITIONS, LEAST_AGREEING * len(scene)):
             raise SimilarityError(

@@ -90,6 +90,9 @@ def reconstruct(
     model: str | None = None,
     masks: Literal["ignore", "alpha"] | None = None,
     evaluation_background: Literal["black", "white"] | None = None,
+    georeference: Literal["auto", "gps", "off"] | None = None,
+    control_points: str | None = None,
+    known_length: str | None = None,
     minutes: float | None = None,
     exports: Sequence[str] | None = None,
     materials: bool = False,
@@ -102,6 +105,7 @@ def reconstruct(
     train: Mapping[str, Any] | None = None,
     assignments: Sequence[str] | None = None,
     frames_per_second: float | None = None,
+    start_from: PathLike | None = None,
     resume: bool = False,
     on_step: OnStep | None = None,
     progress: EventListener | None = None,
@@ -143,6 +147,15 @@ def reconstruct(
         evaluation_background: What lies behind renders and photographs with alpha when they are
             compared; by default that of the training: white where train.background is white, else
             black.
+        georeference: What says where the scene lies, how large it is, and what is up: auto takes
+            control points, else the GPS positions in the photographs where they agree with the scene;
+            gps refuses the photographs where these do not; off looks for nothing, so that no file says
+            where the photographs were taken. Default: auto.
+        control_points: A file of ground control points in the folder of the photographs: gcp_list.txt
+            as OpenDroneMap has it, or a CSV with name,x,y,z,photograph,px,py; by default gcp_list.txt
+            or control_points.csv where there is one.
+        known_length: Two points and the metres between them, which decide the scale; a point is a
+            control point, a photograph, the number of a sparse point, or x,y,z.
         minutes: Time in which the training is to end, which decides its iterations and Gaussians by the
             pace of the machine that begins it; by default the other settings do.
         exports: Files to write besides scene.ply; their names say the format. Default: ('viewer.glb',
@@ -160,6 +173,8 @@ def reconstruct(
             config list shows them.
         frames_per_second: Of a video: so many frames of each second are taken, the sharpest ones.
             Default: 2.0.
+        start_from: Begin with the Gaussians of that run, finished or stopped, or of a file of
+            Gaussians, instead of the sparse points; poses that the run found are taken, too.
         resume: Go on with the run in the output folder, if there is one; without other options its own
             settings are taken.
         on_step: called with the state of the training every few iterations; returning False stops it
@@ -197,6 +212,9 @@ def reconstruct(
             "model": model,
             "masks": masks,
             "evaluation_background": evaluation_background,
+            "georeference": georeference,
+            "control_points": control_points,
+            "known_length": known_length,
             "minutes": minutes,
             "exports": exports,
             "materials": materials,
@@ -211,6 +229,7 @@ def reconstruct(
             "source": source,
             "output": output,
             "frames_per_second": frames_per_second,
+            "start_from": start_from,
             "resume": resume,
         },
         on_step,
@@ -234,6 +253,9 @@ def estimate(
     model: str | None = None,
     masks: Literal["ignore", "alpha"] | None = None,
     evaluation_background: Literal["black", "white"] | None = None,
+    georeference: Literal["auto", "gps", "off"] | None = None,
+    control_points: str | None = None,
+    known_length: str | None = None,
     minutes: float | None = None,
     exports: Sequence[str] | None = None,
     materials: bool = False,
@@ -281,6 +303,15 @@ def estimate(
         evaluation_background: What lies behind renders and photographs with alpha when they are
             compared; by default that of the training: white where train.background is white, else
             black.
+        georeference: What says where the scene lies, how large it is, and what is up: auto takes
+            control points, else the GPS positions in the photographs where they agree with the scene;
+            gps refuses the photographs where these do not; off looks for nothing, so that no file says
+            where the photographs were taken. Default: auto.
+        control_points: A file of ground control points in the folder of the photographs: gcp_list.txt
+            as OpenDroneMap has it, or a CSV with name,x,y,z,photograph,px,py; by default gcp_list.txt
+            or control_points.csv where there is one.
+        known_length: Two points and the metres between them, which decide the scale; a point is a
+            control point, a photograph, the number of a sparse point, or x,y,z.
         minutes: Time in which the training is to end, which decides its iterations and Gaussians by the
             pace of the machine that begins it; by default the other settings do.
         exports: Files to write besides scene.ply; their names say the format. Default: ('viewer.glb',
@@ -323,6 +354,9 @@ def estimate(
             "model": model,
             "masks": masks,
             "evaluation_background": evaluation_background,
+            "georeference": georeference,
+            "control_points": control_points,
+            "known_length": known_length,
             "minutes": minutes,
             "exports": exports,
             "materials": materials,
@@ -361,6 +395,9 @@ def plan(
     model: str | None = None,
     masks: Literal["ignore", "alpha"] | None = None,
     evaluation_background: Literal["black", "white"] | None = None,
+    georeference: Literal["auto", "gps", "off"] | None = None,
+    control_points: str | None = None,
+    known_length: str | None = None,
     minutes: float | None = None,
     exports: Sequence[str] | None = None,
     materials: bool = False,
@@ -414,6 +451,15 @@ def plan(
         evaluation_background: What lies behind renders and photographs with alpha when they are
             compared; by default that of the training: white where train.background is white, else
             black.
+        georeference: What says where the scene lies, how large it is, and what is up: auto takes
+            control points, else the GPS positions in the photographs where they agree with the scene;
+            gps refuses the photographs where these do not; off looks for nothing, so that no file says
+            where the photographs were taken. Default: auto.
+        control_points: A file of ground control points in the folder of the photographs: gcp_list.txt
+            as OpenDroneMap has it, or a CSV with name,x,y,z,photograph,px,py; by default gcp_list.txt
+            or control_points.csv where there is one.
+        known_length: Two points and the metres between them, which decide the scale; a point is a
+            control point, a photograph, the number of a sparse point, or x,y,z.
         minutes: Time in which the training is to end, which decides its iterations and Gaussians by the
             pace of the machine that begins it; by default the other settings do.
         exports: Files to write besides scene.ply; their names say the format. Default: ('viewer.glb',
@@ -459,6 +505,9 @@ def plan(
             "model": model,
             "masks": masks,
             "evaluation_background": evaluation_background,
+            "georeference": georeference,
+            "control_points": control_points,
+            "known_length": known_length,
             "minutes": minutes,
             "exports": exports,
             "materials": materials,
@@ -542,6 +591,7 @@ def info(
     overwrite: bool = False,
     up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None,
     dataset: PathLike | None = None,
+    rays: bool = False,
     picture: PathLike | None = None,
     progress: EventListener | None = None,
     should_stop: Callable[[], bool] = never_stop,
@@ -556,6 +606,8 @@ def info(
             command or were changed since. What is read is never replaced.
         up: The axis of a file that points up. [default: -y]
         dataset: Take the cameras of the photographs in this folder. [default: those the run keeps]
+        rays: Trace a small picture, too, which tells how many Gaussians a ray meets; the first time
+            this compiles the tracer. --picture does so as well.
         picture: Write a small picture of the scene, too.
         progress: told each event; by default they are logged, or shown in a notebook.
         should_stop: asked now and then; True ends the work with ``CancelledError``.
@@ -575,6 +627,7 @@ def info(
             "up": up,
             "source": source,
             "dataset": dataset,
+            "rays": rays,
             "picture": picture,
             "output": output,
         },

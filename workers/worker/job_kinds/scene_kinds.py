@@ -83,10 +83,8 @@ class SceneEditKind(OperationKind):
         sequence_option: str | None = None,
         keeps_world_frame: bool = True,
     ) -> None:
-        files = dict.fromkeys(
-            (required_file, *RUN_FILES, LIGHT_FILE, EXACT_LIGHT_FILE, BACKGROUND_FILE)
-            + (EDITS_FILE, GEOREFERENCE_FILE)
-        )
+        light = (LIGHT_FILE, EXACT_LIGHT_FILE, BACKGROUND_FILE)
+        files = dict.fromkeys((required_file, *RUN_FILES, *light, EDITS_FILE, GEOREFERENCE_FILE))
         super().__init__(operation, title=title, stages=("edit",), source_files=tuple(files))
         self.keeps_world_frame = keeps_world_frame
         self._sequence_option = sequence_option

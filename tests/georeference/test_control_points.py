@@ -1,0 +1,179 @@
+"""The georeference by ground control points and known lengths, and files that say nonsense."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.georeference import Georeference
+from octasplat.engine.dataset import load_dataset_model
+from octasplat.engine.georeference.find_georeference import find_georeference
+from octasplat.engine.georeference.request import read_request
+from tests.support.located_scene import (
+    PLACE,
+    SCALE,
+    apply,
+    camera_centres,
+    open_scene,
+    project,
+    truth_matrix,
+    write_gps,
+)
+from tests.support.tiny_dataset import make_tiny_dataset
+
+UTM = np.array((691_600.0, 5_334_760.0, 520.0))
+POINTS = np.array([[0.3, 0.1, 0.2], [-0.4, 0.0, 0.3], [0.1, -0.2, -0.4], [-0.2, 0.1, -0.3], [0.4, -0.1, 0.0]])
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory) -> Path:
+    return make_tiny_dataset(tmp_path_factory, views=12, width_px=320, height_px=240, points=50)
+
+
+@pytest.fixture
+def scene(plain, tmp_path) -> Path:
+    return Path(shutil.copytree(plain, tmp_path / "scene"))
+
+
+def sightings(scene: Path, point: np.ndarray) -> list[tuple[str, float, float]]:
+    """Return where photographs show a point."""
+    found = []
+    for view in load_dataset_model(scene).views:
+        x, y = project(scene, view.name, point)
+        seen = view.rotation_cam_from_world @ point + view.translation_cam_from_world
+        if seen[2] > 0 and 0 <= x <= view.width_px and 0 <= y <= view.height_px:
+            found.append((view.name, float(x), float(y)))
+    assert len(found) > 3
+    return found[:4]
+
+
+def gcp_list(scene: Path, ground: np.ndarray, head: str) -> str:
+    rows = [
+        f"{place[0]!r} {place[1]!r} {place[2]!r} {x!r} {y!r} {name} gcp{k}"
+        for k, (point, place) in enumerate(zip(POINTS, ground.tolist(), strict=True))
+        for name, x, y in sightings(scene, point)
+    ]
+    return "\n".join([head, *rows])
+
+
+def csv_text(scene: Path, ground: np.ndarray | None, head: str) -> str:
+    rows = [head, "name,x,y,z,photograph,px,py"]
+    for k, point in enumerate(POINTS):
+        place = ",," if ground is None else ",".join(map(repr, ground[k].tolist()))
+        rows += [f"gcp{k},{place},{name},{x!r},{y!r}" for name, x, y in sightings(scene, point)]
+    return "\n".join(rows)
+
+
+def find(
+    scene: Path, tmp_path: Path, file: str | None = None, length: str | None = None, source: str = "auto"
+) -> Georeference | None:
+    request = read_request(scene, source, file, length)
+    return find_georeference(open_scene(scene, tmp_path / "cache"), request, lambda _text: None)
+
+
+@pytest.mark.parametrize("head", ["EPSG:32632", "WGS84 UTM 32N", "+proj=utm +zone=32 +datum=WGS84"])
+def test_gcp_list_gives_the_similarity(scene, tmp_path, head):
+    ground = apply(truth_matrix(), POINTS) + UTM
+    (scene / "gcp_list.txt").write_text(gcp_list(scene, ground, head))
+    found = find(scene, tmp_path)
+    assert found.crs == "EPSG:32632" and found.method == "control points"
+    there = found.metres_from_scene
+    there[:3, 3] += np.subtract(found.anchor, UTM)
+    np.testing.assert_allclose(there, truth_matrix(), atol=1e-6 * SCALE)
+    assert found.residuals.used == 5 and found.residuals.rmse_m < 1e-6
+
+
+def test_csv_gives_the_similarity_whatever_the_photographs_size(scene, tmp_path):
+    ground = apply(truth_matrix(), POINTS)
+    (scene / "targets.csv").write_text(csv_text(scene, ground, "# local metres"))
+    found = find(scene, tmp_path, "targets.csv")
+    assert found.crs is None and found.anchor is None
+    np.testing.assert_allclose(found.metres_from_scene, truth_matrix(), atol=1e-6 * SCALE)
+
+
+def test_degrees_and_cameras_by_name(scene, tmp_path):
+    import pycolmap
+
+    centres = camera_centres(scene)
+    metres = apply(truth_matrix(), np.stack(list(centres.values())))
+    earth = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
+    degrees = earth.enu_to_ellipsoid(metres, *PLACE)
+    rows = [f"{n},{x!r},{y!r},{z!r}" for n, (y, x, z) in zip(centres, degrees.tolist(), strict=True)]
+    (scene / "control_points.csv").write_text("\n".join(["# EPSG:4326", "name,x,y,z", *rows]))
+    found = find(scene, tmp_path)
+    assert found.crs == "EPSG:4979" and found.metres_per_unit == pytest.approx(SCALE, rel=1e-6)
+    assert found.residuals.rmse_m < 1e-4
+
+
+def test_switched_control_point_is_left_out(scene, tmp_path):
+    ground = apply(truth_matrix(), POINTS)
+    ground[4] += (6.0, 0.0, 0.0)
+    (scene / "gcp_list.txt").write_text(gcp_list(scene, ground, "EPSG:32632"))
+    found = find(scene, tmp_path)
+    assert found.residuals.left_out == ("gcp4",)
+    assert found.metres_per_unit == pytest.approx(SCALE, rel=1e-6)
+
+
+def test_known_length_scales_and_cameras_say_what_is_up(scene, tmp_path):
+    (scene / "marks.csv").write_text(csv_text(scene, None, ""))
+    length = float(np.linalg.norm(POINTS[0] - POINTS[1]) * 3)
+    found = find(scene, tmp_path, "marks.csv", f"gcp0 gcp1 {length!r}")
+    assert found.crs is None and found.metres_per_unit == pytest.approx(3, rel=1e-6)
+    matrix = found.metres_from_scene
+    np.testing.assert_allclose(matrix[:3, :3] @ matrix[:3, :3].T, 9 * np.eye(3), atol=1e-5)
+    assert (matrix[:3, :3] @ (0, 0, 1))[2] > 2.9  # the generated scene has z up
+    cameras = list(camera_centres(scene).items())
+    units = float(np.linalg.norm(cameras[0][1] - cameras[5][1]))
+    by_cameras = find(scene, tmp_path, None, f"{cameras[0][0]} {cameras[5][0]} {2 * units!r}")
+    assert by_cameras.metres_per_unit == pytest.approx(2, rel=1e-9)
+    assert find(scene, tmp_path, None, "0,0,0 0,0,2 1").metres_per_unit == pytest.approx(0.5)
+
+
+def test_known_length_corrects_the_scale_of_gps(scene, tmp_path):
+    centres = camera_centres(scene)
+    metres = apply(truth_matrix(), np.stack(list(centres.values())))
+    write_gps(scene, dict(zip(centres, metres, strict=True)))
+    by_gps = find(scene, tmp_path)
+    found = find(scene, tmp_path, None, "0,0,0 0,0,1 13")
+    assert found.metres_per_unit == pytest.approx(13) and found.crs == by_gps.crs
+    np.testing.assert_allclose(
+        found.metres_from_scene[:3, :3] / 13, by_gps.metres_from_scene[:3, :3] / SCALE, atol=1e-6
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("EPSG:32632\n1 2 3 10 10", "line 2: has 5 values"),
+        ("EPSG:32632\n1 2 3 10 10 nothing.png a", "line 2: there is no photograph nothing.png"),
+        ("EPSG:4258\n1 2 3 10 10 NAME a", "EPSG:4258 gives no metres"),
+        ("somewhere\n1 2 3 10 10 NAME a", "coordinate system 'somewhere' is not known"),
+        ("EPSG:32632\n1 2 x 10 10 NAME a", "line 2: z is 'x', which is no number"),
+        ("EPSG:32632\n1 2 3 10 10 NAME a\n1 2 4 10 10 NAME a", "line 3: a has another position"),
+        ("EPSG:32632\n1 2 3 10 10 NAME a", "a is marked in one photograph"),
+        ("EPSG:32632\n1 2 3 10 10 NAME a\n1 2 3 900 10 OTHER a", "line 3: 900, 10 is outside of"),
+        ("EPSG:32632\n1 2 3 10 10 NAME a\n1 2 3 10 10 OTHER a", "meet in no point|are 1, where 3"),
+        ("name,x,y,z\nnobody,1,2,3", "nobody has no mark"),
+        ("EPSG:32632", "holds no control points"),
+    ],
+)
+def test_bad_files_are_refused_in_one_sentence(scene, tmp_path, text, message):
+    names = list(camera_centres(scene))
+    (scene / "gcp_list.txt").write_text(text.replace("NAME", names[0]).replace("OTHER", names[5]))
+    with pytest.raises(ConfigError, match=message) as refused:
+        find(scene, tmp_path)
+    assert str(scene / "gcp_list.txt") in str(refused.value)
+
+
+@pytest.mark.parametrize("file", ["../elsewhere.csv", "/etc/hostname", "missing.csv"])
+def test_files_outside_of_the_scene_or_missing_are_refused(scene, tmp_path, file):
+    with pytest.raises(ConfigError, match=r"put the file into|cannot be read"):
+        find(scene, tmp_path, file)
+
+
+@pytest.mark.parametrize("length", ["a b", "a b -1", "a a 2", "a 'b 2", "a b nan", "nothing here 2"])
+def test_bad_lengths_are_refused(scene, tmp_path, length):
+    with pytest.raises(ConfigError, match="known_length"):
+        find(scene, tmp_path, None, length)
