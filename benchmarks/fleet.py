@@ -52,6 +52,8 @@ class Fleet:
     address: str = ""
     worker_prefix: tuple[str, ...] = ()
     """Command that begins each worker, such as ``nice``."""
+    settings: Mapping[str, str] = field(default_factory=dict)
+    """Of front end and workers, by names without prefix, where they are to be others than the chaos test's."""
     _database: EmbeddedPostgres = field(init=False)
     _conninfo: str = ""
     _token: str = field(default_factory=new_secret)
@@ -175,7 +177,7 @@ class Fleet:
         settings = {
             **FAST, "HEARTBEAT_SECONDS": "1", "STALE_SECONDS": "12", "KIND_MODULES": KINDS,
             "DATA": str(self.data), "STORAGE": str(self.data / "store"),
-            "FLOOR_BYTES": "0", "TOKEN": self._token, **further,
+            "FLOOR_BYTES": "0", "TOKEN": self._token, **self.settings, **further,
         }  # fmt: skip
         return {
             **os.environ,

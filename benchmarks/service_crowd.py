@@ -35,10 +35,12 @@ from octasplat.workers.client.upload import upload_scene
 STREAMS_PER_OWNER = 50
 PHOTOGRAPH_SIDE_PX = 3200
 HEALTH_SECONDS = 0.05
-LOWEST_PRIORITY = ("sh", "-c", 'echo 19 > /proc/self/autogroup; exec nice -n 19 "$@"', "sh")
+SETTINGS = {"HEARTBEAT_SECONDS": "5", "STALE_SECONDS": "20", "MAX_STREAMS_PER_ADDRESS": "10000"}
+"""Times that users get; all listeners have one address here."""
+LOW_PRIORITY = ("sh", "-c", 'echo 9 > /proc/self/autogroup; exec nice -n 9 "$@"', "sh")
 """Prefix of a worker's command: on hosts of their own they would take no core from the front end.
 
-Between sessions Linux compares the niceness of these groups alone.
+Between sessions Linux compares the niceness of these groups alone. Jobs have the lowest priority then.
 """
 
 
@@ -180,7 +182,12 @@ async def crowd(
             asyncio.create_task(loads[k % len(loads)].listen(ids[k % len(loads)][-1 - k // len(loads)], done))
             for k, done in enumerate(ready)
         ]
-        await asyncio.gather(*(event.wait() for event in ready))
+        all_ready = asyncio.gather(*(event.wait() for event in ready))
+        await asyncio.wait([all_ready, *listeners], return_when=asyncio.FIRST_EXCEPTION)
+        for listener in listeners:
+            if listener.done():
+                listener.result()  # its failure ends the run
+        await all_ready
         found["streams_ready_seconds"] = round(time.perf_counter() - began, 1)
         await sending
         await asyncio.sleep(options.seconds)
@@ -228,7 +235,7 @@ def main() -> None:
         data = Path(name) / "data"
         data.mkdir()
         roots = {"front": ROOT} | {f"w{k:02d}": ROOT for k in range(options.workers)}
-        fleet = Fleet(data, roots, worker_prefix=LOWEST_PRIORITY)
+        fleet = Fleet(data, roots, worker_prefix=LOW_PRIORITY, settings=SETTINGS)
         fleet.begin()
         try:
             tokens = [

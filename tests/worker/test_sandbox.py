@@ -59,9 +59,10 @@ def test_sandboxed_job_sees_no_secrets_and_yields_the_cpu(bench: WorkerHarness) 
     assert bench.wait_until_finished(job_id).state == "succeeded", bench.log(job_id)
     found = json.loads(bench.results(job_id)["found.json"])
     assert found.pop("own environment") == []
-    assert found.pop("niceness") == NICENESS
+    niceness = min(19, os.nice(0) + NICENESS)
+    assert found.pop("niceness") == niceness
     assert found.pop("niceness among sessions") == (
-        str(NICENESS) if Path("/proc/self/autogroup").is_file() else "FileNotFoundError"
+        str(niceness) if Path("/proc/self/autogroup").is_file() else "FileNotFoundError"
     )
     assert {name: got for name, got in found.items() if got != "PermissionError"} == {}
     assert not list(bench.folder.rglob("planted"))

@@ -25,7 +25,7 @@ from octasplat.workers.sandbox.process_tree import kill_descendants
 END_SIGNAL = signal.SIGUSR1
 """Not SIGTERM, which systemd sends to all processes of a service that is to stop by itself."""
 NICENESS = 10
-"""Of a job, so that a front end and a database on the same host answer while all cores are at work."""
+"""By which a job yields to its worker, and to a front end and a database on the same host."""
 _HANDLED = {signal.SIGCHLD, signal.SIGTERM, signal.SIGINT, END_SIGNAL}
 _EAGER_ROUNDS = 2_000
 """At first without pauses, as some may start others as fast as they are killed."""
@@ -67,7 +67,7 @@ def main() -> NoReturn:
 
 def _lower_priority() -> None:
     """Lower the CPU priority of this session."""
-    os.nice(max(0, NICENESS - os.nice(0)))
+    os.nice(NICENESS)
     # Between sessions Linux compares the niceness of these groups alone, where it makes them.
     with contextlib.suppress(OSError):
         Path("/proc/self/autogroup").write_text(str(os.nice(0)), encoding="ascii")
