@@ -53,7 +53,7 @@ class Fleet:
     worker_prefix: tuple[str, ...] = ()
     """Command that begins each worker, such as ``nice``."""
     settings: Mapping[str, str] = field(default_factory=dict)
-    """Of front end and workers, by names without prefix, where they are to be others than the chaos test's."""
+    """Of front end and workers, by names without prefix, where they differ from those of the chaos test."""
     _database: EmbeddedPostgres = field(init=False)
     _conninfo: str = ""
     _token: str = field(default_factory=new_secret)

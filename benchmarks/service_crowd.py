@@ -183,11 +183,11 @@ async def crowd(
             for k, done in enumerate(ready)
         ]
         all_ready = asyncio.gather(*(event.wait() for event in ready))
-        await asyncio.wait([all_ready, *listeners], return_when=asyncio.FIRST_EXCEPTION)
-        for listener in listeners:
-            if listener.done():
-                listener.result()  # its failure ends the run
-        await all_ready
+        while not all_ready.done():
+            waiting = [listener for listener in listeners if not listener.done()]
+            done, _ = await asyncio.wait([all_ready, *waiting], return_when=asyncio.FIRST_COMPLETED)
+            for ended in done:
+                ended.result()  # the failure of a listener ends the run
         found["streams_ready_seconds"] = round(time.perf_counter() - began, 1)
         await sending
         await asyncio.sleep(options.seconds)
