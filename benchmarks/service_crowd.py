@@ -31,11 +31,18 @@ from benchmarks.fleet import Fleet
 from benchmarks.service_load import Load, front_end_memory
 from octasplat.workers.client.api import Api
 from octasplat.workers.client.upload import upload_scene
+from octasplat.workers.settings import WorkerSettings
 
 STREAMS_PER_OWNER = 50
 PHOTOGRAPH_SIDE_PX = 3200
 HEALTH_SECONDS = 0.05
-SETTINGS = {"HEARTBEAT_SECONDS": "5", "STALE_SECONDS": "20", "MAX_STREAMS_PER_ADDRESS": "10000"}
+SETTINGS = {
+    "MAX_STREAMS_PER_ADDRESS": "10000",
+    **{
+        f"{name.upper()}_SECONDS": str(WorkerSettings.model_fields[f"{name}_seconds"].default)
+        for name in ("heartbeat", "stale", "rescue", "poll")
+    },
+}
 """Times that users get; all listeners have one address here."""
 LOW_PRIORITY = ("sh", "-c", 'echo 9 > /proc/self/autogroup; exec nice -n 9 "$@"', "sh")
 """Prefix of a worker's command: on hosts of their own they would take no core from the front end.
