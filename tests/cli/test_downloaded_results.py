@@ -12,8 +12,8 @@ import trimesh
 from octasplat.engine.core.events import Event, Warned
 from octasplat.engine.render.image_files import read_image
 from octasplat.engine.runs.config import resolve_config
-from octasplat.workers.worker.handlers import reconstruct
 from octasplat.workers.worker.job_kinds import get_job_kind
+from octasplat.workers.worker.reconstruct_handler import reconstruct
 from octasplat.workers.worker.task import Task
 
 SETTINGS = (

@@ -3,16 +3,23 @@
 ``OCTASPLAT_TEST_IDS`` names a file that maps each path parameter to ids. Those under ``used`` may be changed
 and deleted, so each serves one request; those under ``kept`` are for reading. Requests that follow links name
 what came of those before them. ZIP files are scenes, sound ones and ones that lie.
+
+With ``OCTASPLAT_TEST_THINNED`` each place in a body has one request for each way of being wrong there,
+whatever alternatives the place is in. Every option of every kind of job with each of five wrong types would
+be four fifths of all requests.
 """
 
 import itertools
 import json
 import os
+import re
+import threading
 from pathlib import Path
 from typing import Any
 
 import schemathesis
 from hypothesis import strategies as st
+from schemathesis.core.parameters import ParameterLocation
 from schemathesis.generation.meta import TestPhase
 
 from tests.support.model_builder import ColmapModelBuilder, photographs
@@ -28,6 +35,26 @@ _FIELDS = st.dictionaries(
     st.integers(0, 0xFFFF),
     max_size=2,
 )
+
+_IS_THINNED = "OCTASPLAT_TEST_THINNED" in os.environ
+_ALTERNATIVES = re.compile(r"/(?:anyOf|oneOf|allOf)/\d+")
+_SEEN: set[tuple[object, ...]] = set()
+_LOCK = threading.Lock()
+
+
+@schemathesis.hook
+def filter_case(_context: schemathesis.HookContext, case: schemathesis.Case) -> bool:
+    if not _IS_THINNED or case.meta is None or case.meta.phase.name != TestPhase.COVERAGE:
+        return True
+    data: Any = case.meta.phase.data
+    if data.parameter_location != ParameterLocation.BODY:
+        return True
+    place = _ALTERNATIVES.sub("", data.location) if data.location else data.description
+    key = (case.operation.label, data.scenario, place)
+    with _LOCK:
+        is_new = key not in _SEEN
+        _SEEN.add(key)
+    return is_new
 
 
 @schemathesis.hook

@@ -1,4 +1,4 @@
-"""The built-in kinds of jobs."""
+"""The built-in kinds of jobs; imported when the table of kinds is first asked for one of them."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -30,7 +30,7 @@ from octasplat.engine.runs.config import ReconstructionConfig, revise_requested
 from octasplat.engine.train.config import MAX_PLANNED_ITERATIONS, iteration_count, max_gaussian_count
 from octasplat.workers.worker.job_kinds.image_kinds import RelightKind, RenderKind
 from octasplat.workers.worker.job_kinds.operation_kind import OperationKind
-from octasplat.workers.worker.job_kinds.registry import register
+from octasplat.workers.worker.job_kinds.registry import JobKind
 from octasplat.workers.worker.job_kinds.resource_limits import ResourceDemand
 from octasplat.workers.worker.job_kinds.scene_kinds import (
     BACKGROUND_FILE,
@@ -140,73 +140,59 @@ class InfoKind(OperationKind):
         }
 
 
-def register_builtin_kinds() -> None:
-    """Register the built-in kinds of jobs."""
-    register(
-        ReconstructKind(
-            RECONSTRUCT,
-            title="Photographs to a scene, its meshes and measurements",
-            stages=(),
-            needs="dataset",
-            complete_options=ReconstructionConfig,
-            program="octasplat.workers.worker.handlers:reconstruct",
-            reports_stages=True,
-        )
-    )
-    register(
-        EvaluateKind(
-            EVALUATE,
-            title="Measure views of a reconstruction: those held out again, or other photographs",
-            stages=("evaluate",),
-            source_files=(
-                *RUN_FILES,
-                *(LIGHT_FILE, EXACT_LIGHT_FILE, BACKGROUND_FILE, EDITS_FILE, GEOREFERENCE_FILE),
-            ),
-            reports_stages=True,
-        )
-    )
-    register(ExportKind())
-    register(
-        RenderKind(
-            RENDER,
-            title="New views of the scene of a reconstruction, as a video or images",
-            source_files=(*RUN_FILES[:4], LIGHT_FILE, EXACT_LIGHT_FILE, BACKGROUND_FILE),
-        )
-    )
-    register(
-        RelightKind(
-            RELIGHT,
-            title="The scene of a reconstruction with materials in other light",
-            source_files=(LIGHT_FILE, *RUN_FILES[:4]),
-        )
-    )
-    register(
-        OperationKind(
-            STAGE_INIT,
-            title="A commented stage that fits the scene of a reconstruction",
-            stages=("read",),
-            source_files=(*RUN_FILES[:4], BACKGROUND_FILE),
-            output="stage.toml",
-        )
-    )
-    register(
-        SceneEditKind(
-            MATERIAL, title="The scene of a reconstruction with other materials", required_file=LIGHT_FILE
-        )
-    )
-    register(
-        InfoKind(
-            INFO,
-            title="What is in the scene of a reconstruction: counts, bounds, sizes, cost",
-            stages=("read",),
-            source_files=(*RUN_FILES[:4], BACKGROUND_FILE, GEOREFERENCE_FILE),
-        )
-    )
-    register(SurfaceKind())
-    register(SceneEditKind(CROP))
-    register(SceneEditKind(CLEAN))
-    register(SceneEditKind(TRANSFORM, keeps_world_frame=False))
-    register(SceneEditKind(EDIT, sequence_option="meshes"))
-    register(SceneEditKind(DEFORM, sequence_option="deformed"))
-    register(SceneEditKind(MERGE))
-    register(ImportKind())
+BUILTIN_KINDS: tuple[JobKind[Any], ...] = (
+    ReconstructKind(
+        RECONSTRUCT,
+        title="Photographs to a scene, its meshes and measurements",
+        stages=(),
+        needs="dataset",
+        complete_options=ReconstructionConfig,
+        program="octasplat.workers.worker.reconstruct_handler:reconstruct",
+        reports_stages=True,
+    ),
+    EvaluateKind(
+        EVALUATE,
+        title="Measure views of a reconstruction: those held out again, or other photographs",
+        stages=("evaluate",),
+        source_files=(
+            *RUN_FILES,
+            *(LIGHT_FILE, EXACT_LIGHT_FILE, BACKGROUND_FILE, EDITS_FILE, GEOREFERENCE_FILE),
+        ),
+        reports_stages=True,
+    ),
+    ExportKind(),
+    RenderKind(
+        RENDER,
+        title="New views of the scene of a reconstruction, as a video or images",
+        source_files=(*RUN_FILES[:4], LIGHT_FILE, EXACT_LIGHT_FILE, BACKGROUND_FILE),
+    ),
+    RelightKind(
+        RELIGHT,
+        title="The scene of a reconstruction with materials in other light",
+        source_files=(LIGHT_FILE, *RUN_FILES[:4]),
+    ),
+    OperationKind(
+        STAGE_INIT,
+        title="A commented stage that fits the scene of a reconstruction",
+        stages=("read",),
+        source_files=(*RUN_FILES[:4], BACKGROUND_FILE),
+        output="stage.toml",
+    ),
+    SceneEditKind(
+        MATERIAL, title="The scene of a reconstruction with other materials", required_file=LIGHT_FILE
+    ),
+    InfoKind(
+        INFO,
+        title="What is in the scene of a reconstruction: counts, bounds, sizes, cost",
+        stages=("read",),
+        source_files=(*RUN_FILES[:4], BACKGROUND_FILE, GEOREFERENCE_FILE),
+    ),
+    SurfaceKind(),
+    SceneEditKind(CROP),
+    SceneEditKind(CLEAN),
+    SceneEditKind(TRANSFORM, keeps_world_frame=False),
+    SceneEditKind(EDIT, sequence_option="meshes"),
+    SceneEditKind(DEFORM, sequence_option="deformed"),
+    SceneEditKind(MERGE),
+    ImportKind(),
+)

@@ -1,16 +1,20 @@
 """Base class of job kinds, and their registry."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Generic, Literal
+from functools import cache
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Generic, Literal
 
 from pydantic import BaseModel, ValidationError
 from typing_extensions import TypeVar
 
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.dataset.image_sizes import ImageSizes
-from octasplat.engine.operations.cost_model import Estimate
 from octasplat.engine.settings.renamed_settings import replace_former_names
 from octasplat.workers.worker.job_kinds.resource_limits import ResourceDemand
+
+if TYPE_CHECKING:
+    from octasplat.engine.operations.cost_model import Estimate
 
 OptionsT = TypeVar("OptionsT", bound=BaseModel, default=Any)
 
@@ -123,16 +127,26 @@ class JobKind(Generic[OptionsT]):
         """Return the files that the options name, each after the place where they do, with dots."""
         return ()
 
-    def estimate(self, options: OptionsT, sizes: Sequence[ImageSizes], cores: int) -> Estimate | None:
+    def estimate(self, options: OptionsT, sizes: Sequence[ImageSizes], cores: int) -> "Estimate | None":
         """Return the time and memory on so many cores; None where it is unknown."""
         return None
 
 
+_BUILTIN_MODULE = "octasplat.workers.worker.job_kinds.builtin"
+"""Holds ``BUILTIN_KINDS``; not imported here, as the process of a job of another kind goes without."""
+
 _KINDS: dict[str, JobKind[Any]] = {}
+"""Those that are not built in."""
+
+
+@cache
+def _builtin_kinds() -> Mapping[str, JobKind[Any]]:
+    """Return the built-in kinds by name."""
+    return {kind.name: kind for kind in import_module(_BUILTIN_MODULE).BUILTIN_KINDS}
 
 
 def register(kind: JobKind[Any]) -> JobKind[Any]:
-    """Add a kind; its name must be new."""
+    """Add a kind; its name must be new, which :func:`job_kinds` compares with those of the built-in ones."""
     if kind.name in _KINDS:
         raise ValueError(f"a job kind named '{kind.name}' is registered already")
     _KINDS[kind.name] = kind
@@ -140,8 +154,11 @@ def register(kind: JobKind[Any]) -> JobKind[Any]:
 
 
 def job_kinds() -> tuple[JobKind[Any], ...]:
-    """Return all kinds, in the order in which they were registered."""
-    return tuple(_KINDS.values())
+    """Return all kinds: the built-in ones, then others in the order in which they were registered."""
+    builtin = _builtin_kinds()
+    for name in builtin.keys() & _KINDS.keys():
+        raise ValueError(f"a job kind named '{name}' is built in already")
+    return (*builtin.values(), *_KINDS.values())
 
 
 def get_job_kind(name: str) -> JobKind[Any]:
@@ -150,9 +167,11 @@ def get_job_kind(name: str) -> JobKind[Any]:
     Raises:
         ConfigError: there is none.
     """
-    if name not in _KINDS:
-        raise ConfigError(f"There is no job kind '{name}'; choose one of {', '.join(_KINDS)}.")
-    return _KINDS[name]
+    kind = _KINDS.get(name) or _builtin_kinds().get(name)
+    if kind is None:
+        names = ", ".join(known.name for known in job_kinds())
+        raise ConfigError(f"There is no job kind '{name}'; choose one of {names}.")
+    return kind
 
 
 __all__ = ["JobKind", "ValidationError", "get_job_kind", "job_kinds", "register"]
