@@ -15,6 +15,9 @@ from octasplat.engine.blocks.piece_settings import (
     block_settings,
     coarse_settings,
     coarse_side_px,
+    finish_iterations,
+    finish_settings,
+    fits_together,
     polish_settings,
 )
 from octasplat.engine.blocks.piece_training import BlockWork, Piece, is_piece_done, piece_record, train_piece
@@ -28,7 +31,7 @@ from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import Tracer
-from octasplat.engine.train.config import TrainConfig, iteration_count
+from octasplat.engine.train.config import TrainConfig, iteration_count, max_gaussian_count
 from octasplat.engine.train.initialization.initial_gaussians import initial_train_state
 from octasplat.engine.train.loop.checkpoint import BestState
 from octasplat.engine.train.loop.state import TrainState, initial_state
@@ -41,7 +44,7 @@ from octasplat.engine.train.sampling.pixel_sampler import (
 from octasplat.engine.train.shading_factory import ShadingOptions, make_shading
 from octasplat.engine.train.views.view_grids import estimate_untrained_exposures
 
-COARSE, POLISH = "coarse", "polish"
+COARSE, POLISH, FINISH = "coarse", "polish", "finish"
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +53,7 @@ class BlockScene:
 
     Attributes:
         gaussians: of all blocks, those of one after those of the other.
-        shading: exposures and background, those of the coarse scene.
+        shading: exposures and background, those of the last piece that learnt them.
         record: what each training took, for ``training.json``.
     """
 
@@ -85,8 +88,17 @@ def train_in_blocks(
         work.dataset, coarse.gaussians, count, _tracer(work), lambda: _stop_when_asked(work),
         min_side_px=_min_side_px(work.config),
     )  # fmt: skip
-    settings = [block_settings(work.config, block.share, most_gaussians) for block in blocks]
-    tell.expect(_expected_iterations(work, blocks, settings))
+    is_finished_together = _is_finished_together(work, blocks, most_gaussians)
+    settings = [
+        block_settings(work.config, block.share, most_gaussians, is_finished_later=is_finished_together)
+        for block in blocks
+    ]
+    lengths = [
+        _block_iterations(work, block.pixels, config) if block.is_trained else 0
+        for block, config in zip(blocks, settings, strict=True)
+    ]
+    last = FINISH if is_finished_together else POLISH
+    tell.expect(_expected_iterations(work, blocks, lengths, last))
     cores = [
         _train_block(work, number, block, config, coarse, tell, count)
         for number, (block, config) in enumerate(zip(blocks, settings, strict=True), start=1)
@@ -99,9 +111,12 @@ def train_in_blocks(
     )
     merged = concatenate([with_sh_degree(core, work.config.sh_degree) for core in cores])
     del cores
-    merged = _polish(work, merged, is_near_cut, coarse, tell)
-    shading = _final_shading(work, merged, coarse)
-    pieces = [COARSE, *(_block_name(number) for number in range(1, count + 1)), POLISH]
+    if is_finished_together:
+        finished = _finish(work, merged, coarse, tell, finish_iterations(lengths))
+    else:
+        finished = BestState(_polish(work, merged, is_near_cut, coarse, tell), coarse.shading)
+    merged, shading = finished.gaussians, _final_shading(work, finished)
+    pieces = [COARSE, *(_block_name(number) for number in range(1, count + 1)), last]
     return BlockScene(merged, shading, {name: piece_record(work, name) for name in pieces})
 
 
@@ -152,6 +167,31 @@ def _train_block(
     return result.gaussians.select(block.core.contains(result.gaussians.means_world))
 
 
+def _is_finished_together(work: BlockWork, blocks: Sequence[Block], most_gaussians: int | None) -> bool:
+    """Return whether one training may hold the Gaussians of all blocks."""
+    counts = []
+    for block in blocks:
+        config = block_settings(work.config, block.share, most_gaussians, is_finished_later=False)
+        valid = valid_pixel_fraction(BlockDataset(work.dataset, block.pixels)) if block.is_trained else 1.0
+        counts.append(max_gaussian_count(config, block.pixels.drawn_pixel_count, valid))
+    return fits_together(work.config, counts, [block.share for block in blocks], most_gaussians)
+
+
+def _finish(
+    work: BlockWork, merged: FlatGaussians, coarse: BestState, tell: PieceProgress, iterations: int
+) -> BestState:
+    """Return the scene of which all Gaussians, exposures and the background went on together to the end."""
+
+    def start() -> TrainState:
+        work.progress(Noted(f"All blocks are finished together, {len(merged)} Gaussians."))
+        state = initial_state(merged, work.config.seed)
+        state.shading = dict(coarse.shading)
+        return state
+
+    piece = Piece(FINISH, work.dataset, finish_settings(work.config, iterations), start)
+    return train_piece(work, piece, tell.of_piece(FINISH))
+
+
 def _polish(
     work: BlockWork,
     merged: FlatGaussians,
@@ -169,7 +209,7 @@ def _polish(
     if len(pixels) == 0:
         return merged
     data = BlockDataset(work.dataset, pixels)
-    iterations = _polish_iterations(work.config, pixels.pixel_count, valid_pixel_fraction(data))
+    iterations = _polish_iterations(work.config, pixels.drawn_pixel_count, valid_pixel_fraction(data))
     config = polish_settings(work.config, iterations)
 
     def start() -> TrainState:
@@ -184,34 +224,34 @@ def _polish(
     return merged
 
 
-def _final_shading(work: BlockWork, merged: FlatGaussians, coarse: BestState) -> ShadingModel:
-    """Return the shading of the coarse scene, with exposures of held-out views as the merged one has them."""
+def _final_shading(work: BlockWork, scene: BestState) -> ShadingModel:
+    """Return the shading of a scene, with exposures of held-out views as the scene suggests them."""
     options = ShadingOptions.from_config(work.config)
     shading = make_shading(options, len(work.dataset.views), work.dataset.extent)
-    if coarse.shading:
-        shading.restore(dict(coarse.shading))
+    if scene.shading:
+        shading.restore(dict(scene.shading))
     tracer = _tracer(work)
-    tracer.build(merged, shading.features(merged))
+    tracer.build(scene.gaussians, shading.features(scene.gaussians))
     background = evaluation_background(work.config.background)
     estimate_untrained_exposures(work.dataset, background, tracer, shading)
     return shading
 
 
 def _expected_iterations(
-    work: BlockWork, blocks: Sequence[Block], settings: Sequence[TrainConfig]
+    work: BlockWork, blocks: Sequence[Block], lengths: Sequence[int], last: str
 ) -> dict[str, int]:
     """Return the iterations of all pieces; those of the polish are a guess."""
     counts = {COARSE: coarse_settings(work.config).iterations}
-    for number, (block, config) in enumerate(zip(blocks, settings, strict=True), start=1):
-        counts[_block_name(number)] = _block_iterations(work, block.pixels, config) if block.is_trained else 0
-    overlap = sum(block.pixels.pixel_count for block in blocks) // len(blocks)
-    counts[POLISH] = _polish_iterations(work.config, overlap, 1.0)
-    return counts
+    counts |= {_block_name(number): length for number, length in enumerate(lengths, start=1)}
+    if last == FINISH:
+        return {**counts, FINISH: finish_iterations(lengths)}
+    overlap = sum(block.pixels.drawn_pixel_count for block in blocks) // len(blocks)
+    return {**counts, POLISH: _polish_iterations(work.config, overlap, 1.0)}
 
 
 def _block_iterations(work: BlockWork, pixels: Rectangles, config: TrainConfig) -> int:
     data = BlockDataset(work.dataset, pixels)
-    return iteration_count(config, pixels.pixel_count, valid_pixel_fraction(data))
+    return iteration_count(config, pixels.drawn_pixel_count, valid_pixel_fraction(data))
 
 
 def _polish_iterations(config: TrainConfig, pixels: int, valid_fraction: float) -> int:

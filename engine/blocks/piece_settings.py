@@ -1,9 +1,10 @@
 """Settings of the trainings of a run in blocks, made from those of the run."""
 
 import math
+from collections.abc import Sequence
 
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.train.config import TrainConfig
+from octasplat.engine.train.config import McmcConfig, TrainConfig, uses_shared_sort
 
 COARSE_ITERATIONS, COARSE_GAUSSIANS = 2_500, 50_000
 """Most of the coarse scene, as of the preset fast."""
@@ -13,8 +14,20 @@ of half the size have a quarter of the pixels."""
 MIN_COARSE_GAUSSIANS = 4_000
 """Which are soon trained; fewer where the whole scene has fewer."""
 MIN_COARSE_SIDE_PX = 200
+COARSE_RAY_FRACTION = 1 / 2
+"""Rays of an iteration of the coarse scene, of those of the run."""
+BLOCK_GROWTH = 1.0
+"""Growth of blocks at each interval: the coarse scene has few Gaussians, and soon many are to learn."""
 POLISH_FRACTION = 0.1
 """Iterations of the polish, of those that an ordinary training of its pixels takes."""
+DECAYING_RATES = ("quat", "log_scale", "opacity", "color", "exposure", "background")
+"""Rates that fall to a share of their first size."""
+FINISH_FROM = 0.7
+"""Share of the schedule of a training that blocks go through where all of them are finished together."""
+FINISH_FRACTION = 1 / 3
+"""Iterations of finishing all blocks together, of those of the blocks."""
+FINISH_AVERAGING_START = 0.5
+"""Share of them after which states are averaged."""
 
 
 def require_blocks_possible(config: TrainConfig, *, has_time_budget: bool) -> None:
@@ -49,31 +62,106 @@ def coarse_settings(config: TrainConfig) -> TrainConfig:
     return config.model_copy(
         update={
             "iterations": min(iterations, COARSE_ITERATIONS),
+            "rays_per_batch": _coarse_rays(config),
+            "shared_sort_until": 1.0 if uses_shared_sort(config) else 0.0,
             "max_gaussians": min(most_gaussians, COARSE_GAUSSIANS),
             "max_gaussians_auto": min(config.max_gaussians_auto, COARSE_GAUSSIANS),
         }
     )
 
 
-def block_settings(config: TrainConfig, share: float, most_gaussians: int | None) -> TrainConfig:
+def _coarse_rays(config: TrainConfig) -> int:
+    """Return the rays of an iteration of the coarse scene; patches for SSIM need all of them."""
+    return math.ceil((1 if config.loss.ssim > 0 else COARSE_RAY_FRACTION) * config.rays_per_batch)
+
+
+def block_settings(
+    config: TrainConfig, share: float, most_gaussians: int | None, *, is_finished_later: bool
+) -> TrainConfig:
     """Return the settings of a block; exposures and background are those of the coarse scene.
 
     Args:
         config: of the run; its iterations hold for each block, its most Gaussians for all of them.
         share: of the whole scene that the block with its margin makes.
         most_gaussians: of any block; None for no such limit.
+        is_finished_later: whether it goes only through the first part of a training's schedule, see
+            :func:`finish_settings`.
     """
+    if is_finished_later:
+        config = _first_part(config)
     most = round(config.max_gaussians * share)
     most_auto = config.max_gaussians_auto
     if most_gaussians is not None:
         most, most_auto = min(most, most_gaussians), min(most_auto, most_gaussians)
+    densify = config.densify
+    if isinstance(densify, McmcConfig):
+        densify = densify.model_copy(update={"growth": max(densify.growth, BLOCK_GROWTH)})
     if config.max_gaussians:  # 0 asks the photographs' pixels
         most = max(most, 1)
     return config.model_copy(
         update={
             "max_gaussians": most,
             "max_gaussians_auto": most_auto,
+            "densify": densify,
             "lr": config.lr.model_copy(update={"exposure": 0.0, "background": 0.0}),
+        }
+    )
+
+
+def fits_together(
+    config: TrainConfig, block_gaussians: Sequence[int], shares: Sequence[float], most_gaussians: int | None
+) -> bool:
+    """Return whether one training may hold the Gaussians of all blocks, so that they are finished together.
+
+    Args:
+        config: of the run.
+        block_gaussians: most Gaussians of each block with its margin.
+        shares: of the whole scene that each block with its margin makes.
+        most_gaussians: of any training; None for the most that the settings allow the whole scene.
+    """
+    expected = config.max_gaussians or round(sum(block_gaussians) / sum(shares))
+    return expected <= (most_gaussians or config.max_gaussians or config.max_gaussians_auto)
+
+
+def finish_settings(config: TrainConfig, iterations: int) -> TrainConfig:
+    """Return the settings of finishing all blocks together: the rest of the schedule that they began.
+
+    Nothing is added or moved elsewhere any more. Exposures and background are learnt again.
+    """
+    lr = _first_part(config).lr
+    # each rate goes on from where the blocks' has ended
+    begun = {name: getattr(lr, name) * lr.decay for name in DECAYING_RATES}
+    rates = {**begun, "mean": lr.mean_final, "mean_final": config.lr.mean_final}
+    rest = (config.shared_sort_until - FINISH_FROM) / (1 - FINISH_FROM)
+    return config.model_copy(
+        update={
+            "iterations": iterations,
+            "densify_from_iter": iterations + 1,
+            "early_stopping_db": 0.0,
+            "shared_sort_until": max(0.0, rest),
+            "weight_averaging_start": FINISH_AVERAGING_START,
+            "lr": lr.model_copy(update={**rates, "decay": config.lr.decay / lr.decay, "scale_after": 0}),
+        }
+    )
+
+
+def finish_iterations(of_blocks: Sequence[int]) -> int:
+    """Return the iterations of finishing all blocks together, after so many of each."""
+    return max(1, round(FINISH_FRACTION * sum(of_blocks)))
+
+
+def _first_part(config: TrainConfig) -> TrainConfig:
+    """Return the settings of a training that ends where the schedule is at ``FINISH_FROM``."""
+    lr, densify = config.lr, config.densify
+    mean_final = lr.mean * (lr.mean_final / lr.mean) ** FINISH_FROM
+    stop_fraction = min(1.0, densify.stop_fraction / FINISH_FROM)
+    return config.model_copy(
+        update={
+            "shared_sort_until": min(1.0, config.shared_sort_until / FINISH_FROM),
+            "weight_averaging_start": min(1.0, config.weight_averaging_start / FINISH_FROM),
+            "early_stopping_db": 0.0,
+            "densify": densify.model_copy(update={"stop_fraction": stop_fraction}),
+            "lr": lr.model_copy(update={"decay": lr.decay**FINISH_FROM, "mean_final": mean_final}),
         }
     )
 

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.trace.protocol import TraceGradients, Tracer
-from octasplat.engine.train.sampling.pixel_sampler import Rectangles, TrainingData
+from octasplat.engine.train.sampling.pixel_sampler import FULL_FREQUENCY, Rectangles, TrainingData
 
 TILE_PX = 64
 """Side of a tile of large views, about; of views whose longer side is less than a dozen of these, less."""
@@ -18,6 +18,8 @@ RAYS_ACROSS_TILE = 4
 """So many rays each way tell what a tile shows."""
 MIN_CONTRIBUTION = 0.05
 """Share of a ray's color that a block's Gaussians must make in some ray of a tile for it to be trained on."""
+MIN_FREQUENCY = 1
+"""Least frequency of a chosen tile: what the block grows there is held against the photographs, too."""
 BLOCKS_PER_TRACE = 8
 
 
@@ -59,14 +61,23 @@ class ViewTiles:
         shape = (down, RAYS_ACROSS_TILE, across, RAYS_ACROSS_TILE, values.shape[1])
         return np.asarray(values.reshape(shape).max(axis=(1, 3)))
 
-    def rectangles(self, chosen: Bool[np.ndarray, "a b"]) -> Rectangles:
-        """Return the chosen tiles, those beside each other in a row as one."""
-        padded = np.pad(chosen, ((0, 0), (1, 1))).astype(np.int8)
-        changes = np.diff(padded, axis=1)
-        (row, first), (_, end) = np.nonzero(changes == 1), np.nonzero(changes == -1)
-        corners = np.stack([self.columns_px[first], self.rows_px[row]], axis=1)
-        ends = np.stack([self.columns_px[end], self.rows_px[row + 1]], axis=1)
-        return Rectangles(np.full(len(row), self.view, np.int64), corners, ends - corners)
+    def tile_sums(self, values: Float32[np.ndarray, "r b"]) -> Float64[np.ndarray, "a c b"]:
+        """Return the sum of the values of the rays of each tile."""
+        down, across = self.shape
+        shape = (down, RAYS_ACROSS_TILE, across, RAYS_ACROSS_TILE, values.shape[1])
+        return np.asarray(values.astype(np.float64).reshape(shape).sum(axis=(1, 3)))
+
+    def rectangles(self, frequency: Int64[np.ndarray, "a b"]) -> Rectangles:
+        """Return the tiles of which something is drawn, those of one frequency in a row as one."""
+        padded = np.pad(frequency, ((0, 0), (1, 1)))
+        row, place = np.nonzero(np.diff(padded, axis=1))  # where a run ends, begins, or both
+        first = padded[row, place + 1] > 0
+        ends = padded[row, place] > 0
+        corners = np.stack([self.columns_px[place[first]], self.rows_px[row[first]]], axis=1)
+        opposite = np.stack([self.columns_px[place[ends]], self.rows_px[row[ends] + 1]], axis=1)
+        count = len(corners)
+        drawn = padded[row[first], place[first] + 1]
+        return Rectangles(np.full(count, self.view, np.int64), corners, opposite - corners, drawn)
 
 
 def tiles_of_views(dataset: TrainingData, min_side_px: int = 1) -> Iterator[ViewTiles]:
@@ -110,7 +121,10 @@ def select_pixels(
     *,
     min_side_px: int = 1,
 ) -> list[Rectangles]:
-    """Return the tiles in which the members of each block contribute to a ray.
+    """Return the tiles in which the members of each block contribute to a ray, and how often to draw each.
+
+    A tile is drawn in proportion to what the members make of what its rays show: so that over all blocks a
+    pixel is drawn about as often as in a training of the whole scene.
 
     Args:
         dataset: the photographs.
@@ -126,10 +140,14 @@ def select_pixels(
         tracer.build(gaussians, np.stack(part, axis=1).astype(np.float32))
         parts: list[list[Rectangles]] = [[] for _ in part]
         for tiles in tiles_of_views(dataset, min_side_px):
-            shares = tracer.trace(dataset.rays(*tiles.pixels())).features
-            is_chosen = tiles.tile_maxima(shares) >= MIN_CONTRIBUTION
+            traced = tracer.trace(dataset.rays(*tiles.pixels()))
+            is_chosen = tiles.tile_maxima(traced.features) >= MIN_CONTRIBUTION
+            frequencies = _frequencies(
+                tiles.tile_sums(traced.features), tiles.tile_sums(traced.alpha[:, None])
+            )
+            frequencies[~is_chosen] = 0
             for block, rectangles in enumerate(parts):
-                rectangles.append(tiles.rectangles(is_chosen[:, :, block]))
+                rectangles.append(tiles.rectangles(frequencies[:, :, block]))
             on_view()
         found += [_join(rectangles) for rectangles in parts]
     return found
@@ -140,7 +158,17 @@ def _join(parts: Sequence[Rectangles]) -> Rectangles:
         np.concatenate([part.view for part in parts]),
         np.concatenate([part.corner_px for part in parts]),
         np.concatenate([part.size_px for part in parts]),
+        np.concatenate([part.frequency for part in parts]),
     )
+
+
+def _frequencies(
+    of_members: Float64[np.ndarray, "a c b"], of_all: Float64[np.ndarray, "a c 1"]
+) -> Int64[np.ndarray, "a c b"]:
+    """Return how often to draw tiles of which members show so much of all that is shown."""
+    shares = of_members / np.maximum(of_all, 1e-6)
+    parts = np.rint(FULL_FREQUENCY * shares).astype(np.int64)
+    return np.clip(parts, MIN_FREQUENCY, FULL_FREQUENCY)
 
 
 def _edges(length_px: int, side_px: int) -> Int64[np.ndarray, " e"]:

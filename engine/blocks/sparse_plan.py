@@ -24,12 +24,14 @@ class SparseBlock:
         share: of what is seen, in the core and its margin.
         view_count: training views that show some of it.
         pixel_count: pixels of them in tiles that show some of it.
+        drawn_pixel_count: the same, those of each tile counted by how much of it shows the block.
     """
 
     core: Box
     share: float
     view_count: int
     pixel_count: int
+    drawn_pixel_count: int
 
 
 def plan_from_points(
@@ -66,23 +68,30 @@ def plan_from_points(
             _pixels_of_view(model, index, xy_px[view == index], member[rows[view == index]])
             for index in train_indices.tolist()
         ]
+        shown, drawn = np.array(pixels).sum(axis=0)
+        view_count = int(np.count_nonzero([shown_px for shown_px, _ in pixels]))
         share = float(weights[member].sum() / weights.sum())
-        found.append(SparseBlock(box, share, int(np.count_nonzero(pixels)), round(sum(pixels))))
+        found.append(SparseBlock(box, share, view_count, round(shown), round(drawn)))
     return tuple(found)
 
 
 def _pixels_of_view(
     model: DatasetModel, index: int, xy_px: Float64[np.ndarray, "k 2"], member: Bool[np.ndarray, " k"]
-) -> float:
-    """Return the pixels of a view in tiles that show members; tiles without any point count in proportion."""
+) -> tuple[float, float]:
+    """Return the pixels of a view in tiles that show members, and these by how much of a tile's points are.
+
+    Tiles without any point count in proportion.
+    """
     view = model.views[index]
     tiles = ViewTiles.of_view(index, view.width_px, view.height_px)
     down, across = tiles.shape
     row = np.clip(np.searchsorted(tiles.rows_px, xy_px[:, 1], side="right") - 1, 0, down - 1)
     column = np.clip(np.searchsorted(tiles.columns_px, xy_px[:, 0], side="right") - 1, 0, across - 1)
     place = row * across + column
-    known = len(np.unique(place))
-    return view.width_px * view.height_px * len(np.unique(place[member])) / known if known else 0.0
+    counts = np.bincount(place, minlength=down * across)
+    shares = np.bincount(place[member], minlength=down * across) / np.maximum(counts, 1)
+    pixels_per_tile = view.width_px * view.height_px / max(int(np.count_nonzero(counts)), 1)
+    return pixels_per_tile * int(np.count_nonzero(shares)), pixels_per_tile * float(shares.sum())
 
 
 def draw_map(model: DatasetModel, cores: Sequence[Box]) -> Float32[np.ndarray, "h w 3"]:

@@ -68,7 +68,7 @@ class PlanResult(Result):
         blocks: the blocks; a single one is an ordinary run.
         photographs: that are trained on.
         cores: number of cores that is reckoned with.
-        coarse_seconds: for the coarse scene and the polish of the merged one.
+        coarse_seconds: for the coarse scene, and for finishing or polishing the merged one.
         seconds: of the whole run by the clock, with nothing else to do.
         memory_bytes: largest memory of any training.
     """
@@ -94,7 +94,7 @@ class PlanResult(Result):
             f"about {format_duration(block.seconds)}"
             for number, block in enumerate(self.blocks, start=1)
         ]
-        rest = f"  coarse scene and polish: about {format_duration(self.coarse_seconds)}"
+        rest = f"  coarse scene and end of the training: about {format_duration(self.coarse_seconds)}"
         first = f"{count} blocks of {self.photographs} photographs: {total}"
         return (first, *blocks, rest, *super().lines())
 
@@ -156,14 +156,17 @@ def _costs(
 ) -> dict[str, object]:
     """Return the figures of a plan by their names."""
     from octasplat.engine.blocks.piece_settings import (
+        FINISH_FRACTION,
         POLISH_FRACTION,
         block_settings,
         coarse_settings,
         coarse_side_px,
+        fits_together,
         require_blocks_possible,
     )
     from octasplat.engine.dataset.image_sizes import ImageSizes
     from octasplat.engine.operations.cost_model import estimate_reconstruction
+    from octasplat.engine.train.config import max_gaussian_count
 
     given = config.with_poses_decided(True)
     original = [ImageSizes(info.width_px, info.height_px, 1) for info in model.image_infos]
@@ -183,11 +186,12 @@ def _costs(
         update={"train": coarse_settings(config.train), "max_side": coarse_side_px(longest)}
     )
     coarse = estimate_reconstruction(smaller, original, cores)
-    planned = []
+    planned, counts = [], []
     for block in blocks:
-        train = block_settings(config.train, block.share, most_gaussians)
+        train = block_settings(config.train, block.share, most_gaussians, is_finished_later=False)
+        counts.append(max_gaussian_count(train, block.drawn_pixel_count))
         # as photographs of which all are trained on and all pixels show the block
-        side = max(1, round((block.pixel_count / max(block.view_count, 1)) ** 0.5))
+        side = max(1, round((block.drawn_pixel_count / max(block.view_count, 1)) ** 0.5))
         alone = given.model_copy(update={"train": train, "held_out": (), "max_side": None})
         cost = estimate_reconstruction(alone, [ImageSizes(side, side, max(block.view_count, 1))], cores)
         planned.append(
@@ -198,14 +202,19 @@ def _costs(
                 memory_bytes=cost.memory_bytes,
             )
         )
-    polish_seconds = POLISH_FRACTION * max(block.seconds for block in planned)
+    block_seconds = [block.seconds for block in planned]
+    block_bytes = [block.memory_bytes for block in planned]
+    last_seconds = POLISH_FRACTION * max(block_seconds)
+    if fits_together(config.train, counts, [block.share for block in blocks], most_gaussians):
+        last_seconds = FINISH_FRACTION * sum(block_seconds)
+        block_bytes.append(whole.memory_bytes)
     besides = whole.seconds - whole.stage_seconds["train"]
-    extra = coarse.stage_seconds["train"] + polish_seconds
+    extra = coarse.stage_seconds["train"] + last_seconds
     return {
         "blocks": tuple(planned),
         "coarse_seconds": round(extra, 1),
-        "seconds": round(besides + extra + sum(block.seconds for block in planned), 1),
-        "memory_bytes": max(coarse.memory_bytes, *(block.memory_bytes for block in planned)),
+        "seconds": round(besides + extra + sum(block_seconds), 1),
+        "memory_bytes": max(coarse.memory_bytes, *block_bytes),
     }
 
 

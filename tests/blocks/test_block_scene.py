@@ -65,6 +65,14 @@ def two_blocks(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[P
     return output, events
 
 
+@pytest.fixture(scope="module")
+def polished_blocks(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run in two blocks that no training may hold together, so that those near the cut are polished."""
+    output = tmp_path_factory.mktemp("polished") / "run"
+    reconstruct(scene, output, make_config(), threads=1, blocks=BlockRequest(count=2, most_gaussians=1500))
+    return output
+
+
 def psnr(run: Path) -> float:
     return float(json.loads((run / "metrics.json").read_text())["mean"]["psnr"])
 
@@ -75,9 +83,25 @@ def test_two_blocks_are_as_good_as_the_whole(scene: Path, two_blocks: tuple, tmp
     assert not (whole / "blocks").exists()
 
 
-def test_merged_scene_numbers_one_core_after_the_other(scene: Path, two_blocks: tuple) -> None:
-    """Each block's kept Gaussians are those in its box, in its order; only those near the cut move on."""
+def test_blocks_that_fit_together_are_finished_together(two_blocks: tuple) -> None:
+    """Those that fit into one training all move on, and exposures are learnt again."""
     run, _ = two_blocks
+    coarse, finished = (load_best(run / "blocks" / name) for name in ("coarse", "finish"))
+    merged, _ = read_gaussian_ply(run / "scene.ply")
+    np.testing.assert_array_equal(merged.means_world, finished.gaussians.means_world)
+    blocks = [load_best(run / "blocks" / f"block_{number:03d}") for number in (1, 2)]
+    for block in blocks:
+        np.testing.assert_array_equal(block.shading["exposure.offsets"], coarse.shading["exposure.offsets"])
+        assert not np.isin(block.gaussians.means_world, merged.means_world).any()
+    assert np.abs(finished.shading["exposure.offsets"] - coarse.shading["exposure.offsets"]).max() > 0
+
+
+def test_merged_scene_numbers_one_core_after_the_other(scene: Path, polished_blocks: Path) -> None:
+    """Each block's kept Gaussians are those in its box, in its order; only those near the cut move on."""
+    run = polished_blocks
+    record = json.loads((run / "training.json").read_text())
+    assert list(record["pieces"]) == ["coarse", "block_001", "block_002", "polish"]
+    assert record["iterations"] == 150 + 300 * 2 + 30
     merged, _ = read_gaussian_ply(run / "scene.ply")
     dataset = Dataset.open(scene, run / "cache", test_every=4)
     coarse = load_best(run / "blocks" / "coarse").gaussians
@@ -102,13 +126,13 @@ def test_progress_counts_all_trainings(two_blocks: tuple) -> None:
     run, events = two_blocks
     told = [event for event in events if isinstance(event, TrainingProgress)]
     assert [event.iteration for event in told] == sorted(event.iteration for event in told)
-    assert told[-1].iteration == told[-1].total_iterations == 150 + 300 * 2 + 30
+    assert told[-1].iteration == told[-1].total_iterations == 150 + 300 * 2 + 200
     assert told[-1].seconds_left == 0
     record = json.loads((run / "training.json").read_text())
-    assert record["iterations"] == 780
-    assert list(record["pieces"]) == ["coarse", "block_001", "block_002", "polish"]
+    assert record["iterations"] == 950
+    assert list(record["pieces"]) == ["coarse", "block_001", "block_002", "finish"]
     assert len(record["exposures"]) == 40
-    assert sum("Block" in event.message for event in events if isinstance(event, Noted)) == 2
+    assert sum("Block " in event.message for event in events if isinstance(event, Noted)) == 2
     assert not any((run / "blocks").rglob("checkpoints"))
 
 
@@ -123,15 +147,13 @@ def stop_at(condition: Callable[[Event], bool]) -> tuple[Callable[[Event], None]
     return listen, lambda: bool(met)
 
 
-@pytest.mark.parametrize("place", ["coarse", "block_001", "block_002", "polish"])
+@pytest.mark.parametrize("place", ["coarse", "block_001", "block_002", "finish"])
 def test_stopped_run_ends_with_the_same_bytes(
     scene: Path, two_blocks: tuple, tmp_path: Path, place: str
 ) -> None:
     run = tmp_path / "run"
 
     def is_there(event: Event) -> bool:
-        if place == "polish":  # which ends before its first checkpoint
-            return isinstance(event, Noted) and "near to cuts" in event.message
         return isinstance(event, CheckpointWritten) and place in event.path
 
     listen, should_stop = stop_at(is_there)

@@ -1,7 +1,7 @@
 """What training needs of a dataset, and pixels drawn from its views: singly, in ray patches, or in blocks."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -14,6 +14,8 @@ from octasplat.engine.shading.ray_patches import morton_cells
 
 GOLDEN_RATIO = (math.sqrt(5) - 1) / 2
 """Its multiples fill the unit interval evenly, however many there are."""
+FULL_FREQUENCY = 8
+"""Parts in which it is counted how often pixels of a rectangle are drawn."""
 VALID_PIXEL_SAMPLES = 20_000
 """Pixels by which the share of valid ones is estimated, always the same: it is right to 0.4 %."""
 
@@ -57,11 +59,18 @@ class Rectangles:
         view: index of the view of each, ascending.
         corner_px: x and y of the first pixel.
         size_px: width and height, 1 at least.
+        frequency: how often a pixel of each is drawn, in parts of :data:`FULL_FREQUENCY`, 1 at least; none
+            given stands for all of them.
     """
 
     view: Int64[np.ndarray, " k"]
     corner_px: Int64[np.ndarray, "k 2"]
     size_px: Int64[np.ndarray, "k 2"]
+    frequency: Int64[np.ndarray, " k"] = field(default_factory=lambda: np.zeros(0, np.int64))
+
+    def __post_init__(self) -> None:
+        if len(self.frequency) != len(self.view):
+            object.__setattr__(self, "frequency", np.full(len(self.view), FULL_FREQUENCY))
 
     def __len__(self) -> int:
         return len(self.view)
@@ -71,10 +80,17 @@ class Rectangles:
         """Return the number of pixels in all of them."""
         return int(self.size_px.prod(axis=1).sum())
 
+    @property
+    def drawn_pixel_count(self) -> int:
+        """Return how many pixels that are drawn at full frequency would take as long, 1 at least."""
+        return max(1, int((self.size_px.prod(axis=1) * self.frequency).sum()) // FULL_FREQUENCY)
+
     def of_views(self, views: Int64[np.ndarray, " v"]) -> "Rectangles":
         """Return those of some views."""
         is_kept = np.isin(self.view, views)
-        return Rectangles(self.view[is_kept], self.corner_px[is_kept], self.size_px[is_kept])
+        return Rectangles(
+            self.view[is_kept], self.corner_px[is_kept], self.size_px[is_kept], self.frequency[is_kept]
+        )
 
 
 @runtime_checkable
@@ -92,7 +108,7 @@ def pixel_sampler(dataset: TrainingData, view_indices: Int64[np.ndarray, " v"]) 
 
 
 class PixelSampler:
-    """Draws pixels uniformly over all pixels of the given views.
+    """Draws pixels uniformly over all pixels of the given views, or of rectangles by how often each is drawn.
 
     Args:
         view_indices: the views to draw from.
@@ -103,19 +119,26 @@ class PixelSampler:
         self._views = view_indices
         self._sizes = sizes_px[view_indices]
         self._corners = np.zeros_like(self._sizes)
-        self._ends = np.cumsum(self._sizes[:, 0] * self._sizes[:, 1])
+        self._frequency = np.ones(len(view_indices), np.int64)
+        self._lengths = self._sizes[:, 0] * self._sizes[:, 1]
+        self._ends = np.cumsum(self._lengths)
+        self._pixel_count = int(self._lengths.sum())
 
     @classmethod
     def of_rectangles(cls, rectangles: Rectangles) -> "PixelSampler":
         """Return a sampler of the pixels in rectangles, each of which is drawn from as a view is."""
         sampler = cls(np.arange(len(rectangles)), rectangles.size_px)
         sampler._views, sampler._corners = rectangles.view, rectangles.corner_px
+        sampler._frequency = rectangles.frequency
+        sampler._lengths = sampler._lengths * rectangles.frequency
+        sampler._ends = np.cumsum(sampler._lengths)
+        sampler._pixel_count = rectangles.drawn_pixel_count
         return sampler
 
     @property
     def pixel_count(self) -> int:
-        """Return the number of pixels in all views."""
-        return int(self._ends[-1])
+        """Return the number of pixels in all views; those drawn less often count less."""
+        return self._pixel_count
 
     @property
     def smallest_side_px(self) -> int:
@@ -132,10 +155,10 @@ class PixelSampler:
     ) -> tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]:
         """Draw ``count`` pixels as (view, y, x), repeated ones too, sorted by view and row."""
         # sorted, so that neighboring rays read neighboring pixels
-        flat = np.sort(rng.integers(0, self.pixel_count, count))
+        flat = np.sort(rng.integers(0, self._ends[-1], count))
         view_rows = np.searchsorted(self._ends, flat, side="right")
-        width, height = self._sizes[view_rows].T
-        local = flat - (self._ends[view_rows] - width * height)
+        width = self._sizes[view_rows, 0]
+        local = (flat - (self._ends - self._lengths)[view_rows]) // self._frequency[view_rows]
         left, top = self._corners[view_rows].T
         return self._views[view_rows], top + local // width, left + local % width
 
@@ -174,10 +197,11 @@ class PixelSampler:
         steps of one length lead along it, each to a random pixel of the tile there. Each turn begins the
         golden section of a step further on, so that all tiles are seen equally often.
         """
-        at = (np.arange(count) + index * GOLDEN_RATIO % 1.0) * (self.pixel_count / count)
+        at = (np.arange(count) + index * GOLDEN_RATIO % 1.0) * (int(self._ends[-1]) / count)
         view_rows = np.searchsorted(self._ends, at, side="right")
         width, height = self._sizes[view_rows].T
-        share = (at - (self._ends[view_rows] - width * height)) / (width * height)
+        length = self._lengths[view_rows]
+        share = (at - (self._ends[view_rows] - length)) / length
         columns = np.maximum(1, np.rint(width / side).astype(np.int64))
         rows = np.maximum(1, np.rint(height / side).astype(np.int64))
         row, column = np.divmod((share * columns * rows).astype(np.int64), columns)
@@ -191,7 +215,7 @@ class PixelSampler:
         self, rng: np.random.Generator, count: int, side: int
     ) -> tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]:
         """Draw ``count`` patches of ``side`` x ``side`` pixels inside the views: (view, y, x), row-major."""
-        areas = np.diff(self._ends, prepend=0)
+        areas = self._lengths
         # patches by area: any pixel is about as likely
         view_rows = rng.choice(len(self._views), size=count, p=areas / areas.sum())
         width, height = self._sizes[view_rows].T
