@@ -91,9 +91,10 @@ def test_blocks_that_fit_together_are_finished_together(two_blocks: tuple) -> No
     np.testing.assert_array_equal(merged.means_world, finished.gaussians.means_world)
     blocks = [load_best(run / "blocks" / f"block_{number:03d}") for number in (1, 2)]
     for block in blocks:
-        np.testing.assert_array_equal(block.shading["exposure.offsets"], coarse.shading["exposure.offsets"])
+        kept, known = block.shading["exposure.offsets"], coarse.shading["exposure.offsets"]
+        np.testing.assert_allclose(kept, known, atol=1e-5)
         assert not np.isin(block.gaussians.means_world, merged.means_world).any()
-    assert np.abs(finished.shading["exposure.offsets"] - coarse.shading["exposure.offsets"]).max() > 0
+    assert np.abs(finished.shading["exposure.offsets"] - coarse.shading["exposure.offsets"]).max() > 1e-4
 
 
 def test_merged_scene_numbers_one_core_after_the_other(scene: Path, polished_blocks: Path) -> None:
