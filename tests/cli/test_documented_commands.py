@@ -15,6 +15,7 @@ from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_syn
 from octasplat.engine.render.environment_files import write_environment
 from octasplat.engine.render.image_files import write_png
 from tests.support.documentation import DOCS, ROOT, DocumentedCommand, commands
+from tests.support.located_scene import apply, camera_centres, truth_matrix, write_gps
 from tests.support.small_run import RUN_OPTIONS
 
 VERBS = {
@@ -33,7 +34,7 @@ SMALLER = {
     "demo": {"--views": "9", "--width": "48", "--height": "36"},
     "reconstruct": {
         "--iterations": "10",
-        "--max-gaussians": "200",
+        "--max-gaussians": "400",
         "--rays-per-batch": "128",
         "--set": "probe_rays=256",
         "--max-side": "48",
@@ -45,7 +46,7 @@ SMALLER = {
 }
 """Options that keep a command small; those of the page are replaced."""
 REPLACED = {
-    "reconstruct": {"--minutes": "0.1"},
+    "reconstruct": {"--minutes": "0.1", "--known-length": "view_000.png view_005.png 12.5"},
     "surface": {"--texture-size": "128", "--max-triangles": "400"},
 }
 """Values that a command has instead of those of the page, if it has the option."""
@@ -133,8 +134,18 @@ def add_scenes(folder: Path, run: Path, words: Sequence[str]) -> None:
             write_png(folder / "SCENE" / "masks" / f"{photograph.name}.png", mask)
     if "--mask" in words:
         write_png(folder / words[words.index("--mask") + 1], mask)
+    if words[-2:] == ["--georeference", "gps"] or "--control-points" in words:
+        write_places(folder / "SCENE")
     if "-o" in words:
         remove(folder / words[words.index("-o") + 1])
+
+
+def write_places(scene: Path) -> None:
+    """Write where photographs were taken, into them and as control points."""
+    metres = {name: apply(truth_matrix(), centre) for name, centre in camera_centres(scene).items()}
+    write_gps(scene, metres)
+    rows = [",".join([name, *map(repr, place.tolist())]) for name, place in metres.items()]
+    (scene / "targets.csv").write_text("\n".join(["name,x,y,z", *rows]) + "\n", encoding="utf-8")
 
 
 def remove(path: Path) -> None:
