@@ -36,6 +36,7 @@ class Heartbeat:
         self._attempt = attempt
         self._settings = settings
         self._last_sent = claimed_at
+        self._answer_count = 0
 
     @property
     def is_lost(self) -> bool:
@@ -65,6 +66,7 @@ class Heartbeat:
             except DATABASE_ERRORS:
                 # Whether the attempt is lost is decided by the clock, in wait_until_lost.
                 continue
+            self._answer_count += 1
             if beats:
                 self._last_sent = sent
             on_state(state)
@@ -78,6 +80,12 @@ class Heartbeat:
             await asyncio.sleep(tick)
             if time.monotonic() - slept > tick + settings.poll_seconds:
                 # This process was frozen; the database may well answer, and then knows better.
-                await asyncio.sleep(2 * settings.poll_seconds)
+                await self._wait_for_answer(2 * (settings.poll_seconds + settings.heartbeat_seconds), tick)
             if self.is_lost:
                 return
+
+    async def _wait_for_answer(self, most_seconds: float, tick: float) -> None:
+        """Return when the database has answered to what was asked from now on, or after some seconds."""
+        before, until = self._answer_count, time.monotonic() + most_seconds
+        while self._answer_count == before and time.monotonic() < until:
+            await asyncio.sleep(tick)
