@@ -124,17 +124,6 @@ class Fleet:
                 command, cwd=root, env=environment, stderr=log, start_new_session=True
             )
 
-    def restart_ended_workers(self) -> int:
-        """Start workers that have ended by themselves again, as a supervisor does; return how many."""
-        ended = [
-            name
-            for name, process in self._processes.items()
-            if name != "front" and process.poll() is not None
-        ]
-        for name in ended:
-            self.start_worker(name)
-        return len(ended)
-
     def drain_worker(self, name: str) -> int:
         """SIGTERM, upon which it hands back its job, and another start; returns the exit code."""
         code = self._stop(name)

@@ -124,7 +124,7 @@ async def supervise(fleet: Fleet, found: dict[str, Any]) -> None:
     found["workers_restarted"] = 0
     while True:
         await asyncio.sleep(2)
-        found["workers_restarted"] += fleet.restart_ended_workers()
+        found["workers_restarted"] += len(fleet.revive())
 
 
 async def upload(http: httpx.AsyncClient, size_bytes: int, found: dict[str, Any]) -> None:

@@ -49,11 +49,6 @@ class PhaseProgress(Event):
     part: float = 0.0
     work_done: float | None = None
 
-    def as_dict(self) -> dict[str, object]:
-        """Return the event as JSON-ready values; without the share of the work where it is not known."""
-        values = super().as_dict()
-        return values if self.work_done is not None else {k: v for k, v in values.items() if k != "work_done"}
-
 
 @dataclass(frozen=True)
 class PhaseFinished(Event):

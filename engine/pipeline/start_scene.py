@@ -15,7 +15,7 @@ from pydantic import BaseModel
 
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.events import EventListener, Noted, Warned
-from octasplat.engine.core.local_origin import Origin
+from octasplat.engine.core.local_origin import NO_ORIGIN, Origin
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.dataset.photograph_files import image_folder
@@ -48,9 +48,10 @@ _NO_CORRECTIONS = np.zeros((0, 6))
 
 
 class _StartRecord(BaseModel):
-    """Where the scene is from, and the origin about which its positions are."""
+    """Where the scene is from, its number of Gaussians, and the origin about which its positions are."""
 
     source: str
+    count: int
     origin_world: tuple[float, float, float]
 
 
@@ -92,7 +93,7 @@ def keep_start(scene: Path, output: Path, source: Path | None, *, is_new: bool) 
         _copy_found_poses(scene, output, source)
         if (source / VIEWS).exists():
             write_views(folder / VIEWS, read_views(source / VIEWS))
-    record = _StartRecord(source=str(source.resolve()), origin_world=origin_world)
+    record = _StartRecord(source=str(source.resolve()), count=len(state.gaussians), origin_world=origin_world)
     write_json(path, record.model_dump(mode="json"))  # last, as it says that all is there
 
 
@@ -107,7 +108,8 @@ def check_start(output: Path, dataset: Dataset, config: TrainConfig, progress: E
     Raises:
         ConfigError: it stands in another world, or has more Gaussians than the run may have.
     """
-    source, count = _read_record(output).source, len(load_best(output / START).gaussians)
+    record = _read_record(output)
+    source, count = record.source, record.count
     allowed = max_gaussian_count(config, dataset.train_pixel_count, valid_pixel_fraction(dataset))
     if count > allowed:
         raise ConfigError(
@@ -172,8 +174,10 @@ def started_state(
         progress(
             Noted("What was learnt of exposures, background and light is learnt anew, by other settings.")
         )
-    if config.refine_poses and len(kept.pose_corrections) == len(dataset.views):
+    if config.refine_poses and len(kept.pose_corrections):
         state.pose_corrections = kept.pose_corrections
+    elif np.any(kept.pose_corrections):
+        progress(Noted("The other run refined its poses, and this one trains with those of the model."))
     return state
 
 
@@ -196,7 +200,7 @@ def _read_source(source: Path) -> tuple[BestState, Origin]:
     if (source / SCENE).exists():
         gaussians = read_scene(source / SCENE)[0]
     assert gaussians is not None
-    return BestState(gaussians, shading, corrections), run_origin(source) or (0.0, 0.0, 0.0)
+    return BestState(gaussians, shading, corrections), run_origin(source) or NO_ORIGIN
 
 
 def _copy_found_poses(scene: Path, output: Path, source: Path) -> None:

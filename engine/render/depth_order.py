@@ -41,9 +41,6 @@ def _depth_ranks(
 
 
 def _ranks(values: Float[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
-    """Return ranks from 1 on; equal values share the mean of theirs.
+    from scipy.stats import rankdata  # takes a second, which processes that write no GLB do not need
 
-    As :func:`scipy.stats.rankdata` does, the import of which takes a second.
-    """
-    _, places, counts = np.unique(values, return_inverse=True, return_counts=True)
-    return (np.cumsum(counts) - (counts - 1) / 2)[places]
+    return np.asarray(rankdata(values))

@@ -13,7 +13,7 @@ _TAKEN = frozenset(
     {"scene.ply", "config.json", "held_out.json", "views.json", "events.jsonl", "metrics.json", "report.html"}
     | {"training.json", "plan.json", "environment.hdr", "environment.exr", "background.exr", "edits.json"}
     | {"georeference.json"}
-    | {"renders", "layers", "cache", "checkpoints", "poses"}
+    | {"renders", "layers", "cache", "checkpoints", "poses", "blocks", "start"}
 )  # fmt: skip
 
 

@@ -6,6 +6,8 @@ import uuid
 from collections.abc import AsyncGenerator
 from dataclasses import replace
 
+from psycopg_pool import PoolTimeout
+
 from octasplat.service.actions.access import read_job
 from octasplat.service.auth import Principal, is_still_valid
 from octasplat.service.problems import ProblemError
@@ -88,17 +90,21 @@ async def _stream_events(
         while not service.event_broker.is_closing:
             # Before the events are read, so that one that comes meanwhile wakes the stream again.
             news.clear()
-            async with service.pool.connection() as connection:
-                if time.monotonic() - checked_at >= _ACCESS_CHECK_SECONDS:
-                    if not await is_still_valid(connection, principal):
-                        return
-                    checked_at = time.monotonic()
-                job = await get_job(connection, job_id)
-                if job is None or not principal.may_see(job.owner):
-                    return  # it was deleted, which ends the stream
-                # Before the events are read, so that the last ones are among them.
-                over = job.is_over
-                events = await list_job_events(connection, job_id, after, _PAGE_SIZE)
+            try:
+                async with service.pool.connection() as connection:
+                    if time.monotonic() - checked_at >= _ACCESS_CHECK_SECONDS:
+                        if not await is_still_valid(connection, principal):
+                            return
+                        checked_at = time.monotonic()
+                    job = await get_job(connection, job_id)
+                    if job is None or not principal.may_see(job.owner):
+                        return  # it was deleted, which ends the stream
+                    # Before the events are read, so that the last ones are among them.
+                    over = job.is_over
+                    events = await list_job_events(connection, job_id, after, _PAGE_SIZE)
+            except PoolTimeout:  # all connections are in use: the stream goes on once there is one
+                yield None
+                continue
             for event in events:
                 after = event.number
                 yield _visible_event(principal, event)

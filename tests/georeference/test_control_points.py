@@ -1,6 +1,5 @@
 """The georeference by ground control points and known lengths, and files that say nonsense."""
 
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -21,20 +20,9 @@ from tests.support.located_scene import (
     truth_matrix,
     write_gps,
 )
-from tests.support.tiny_dataset import make_tiny_dataset
 
 UTM = np.array((691_600.0, 5_334_760.0, 520.0))
 POINTS = np.array([[0.3, 0.1, 0.2], [-0.4, 0.0, 0.3], [0.1, -0.2, -0.4], [-0.2, 0.1, -0.3], [0.4, -0.1, 0.0]])
-
-
-@pytest.fixture(scope="module")
-def plain(tmp_path_factory) -> Path:
-    return make_tiny_dataset(tmp_path_factory, views=12, width_px=320, height_px=240, points=50)
-
-
-@pytest.fixture
-def scene(plain, tmp_path) -> Path:
-    return Path(shutil.copytree(plain, tmp_path / "scene"))
 
 
 def sightings(scene: Path, point: np.ndarray) -> list[tuple[str, float, float]]:

@@ -1,6 +1,5 @@
 """The georeference by GPS in the photographs: found exactly, robust, and refused where it says nothing."""
 
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -22,17 +21,6 @@ from tests.support.located_scene import (
     truth_matrix,
     write_gps,
 )
-from tests.support.tiny_dataset import make_tiny_dataset
-
-
-@pytest.fixture(scope="module")
-def plain(tmp_path_factory) -> Path:
-    return make_tiny_dataset(tmp_path_factory, views=12, width_px=32, height_px=24, points=50)
-
-
-@pytest.fixture
-def scene(plain, tmp_path) -> Path:
-    return Path(shutil.copytree(plain, tmp_path / "scene"))
 
 
 def true_metres(scene: Path) -> dict[str, np.ndarray]:

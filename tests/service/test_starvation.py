@@ -1,6 +1,7 @@
 """Whatever some ask for, others are served meanwhile; what is too much is refused and can be repeated."""
 
 import asyncio
+import contextlib
 import threading
 from typing import Any
 
@@ -14,6 +15,8 @@ from octasplat.workers.db.dataset_tasks import count_unfinished
 from tests.support.service_harness import ConnectService, client_with_token, new_job
 
 PATIENCE_SECONDS = 60.0
+STREAM_LOOK_SECONDS = 5.0
+"""A stream looks at the database at least so often."""
 
 
 async def new_dataset(http: httpx.AsyncClient) -> str:
@@ -64,6 +67,24 @@ async def test_dataset_checks_do_not_block_other_requests(
             slow_checks["release"].set()
             done = [task.result().status_code for task in (await asyncio.wait(commits))[0]]
             assert sorted(done) == [200] * 9 + [429] * 4 and slow_checks["most"] == 2
+
+
+async def test_event_stream_outlives_a_want_of_connections(connect_service: ConnectService) -> None:
+    async with asyncio.timeout(PATIENCE_SECONDS), connect_service() as (http, service):
+        job = await new_job(http, service)
+        stream = asyncio.create_task(http.get(f"/v1/jobs/{job['id']}/events"))
+        while service.event_broker.subscriber_count == 0:
+            await asyncio.sleep(0.01)
+        usual, service.pool.timeout = service.pool.timeout, 0.2
+        async with contextlib.AsyncExitStack() as taken:
+            for _ in range(service.pool.max_size):
+                await taken.enter_async_context(service.pool.connection(timeout=PATIENCE_SECONDS))
+            await asyncio.sleep(2 * STREAM_LOOK_SECONDS)
+            assert not stream.done()
+        service.pool.timeout = usual
+        assert (await http.post(f"/v1/jobs/{job['id']}/cancel")).is_success
+        answer = await stream
+        assert answer.status_code == 200 and '"canceled"' in answer.text
 
 
 async def test_commits_of_one_owner_take_turns_with_those_of_others(

@@ -1,6 +1,7 @@
 """Heartbeats of a worker for one attempt, and the clock that runs between them."""
 
 import asyncio
+import contextlib
 import time
 from collections.abc import Callable
 
@@ -36,7 +37,7 @@ class Heartbeat:
         self._attempt = attempt
         self._settings = settings
         self._last_sent = claimed_at
-        self._answer_count = 0
+        self._answered = asyncio.Event()
 
     @property
     def is_lost(self) -> bool:
@@ -66,7 +67,7 @@ class Heartbeat:
             except DATABASE_ERRORS:
                 # Whether the attempt is lost is decided by the clock, in wait_until_lost.
                 continue
-            self._answer_count += 1
+            self._answered.set()
             if beats:
                 self._last_sent = sent
             on_state(state)
@@ -80,12 +81,9 @@ class Heartbeat:
             await asyncio.sleep(tick)
             if time.monotonic() - slept > tick + settings.poll_seconds:
                 # This process was frozen; the database may well answer, and then knows better.
-                await self._wait_for_answer(2 * (settings.poll_seconds + settings.heartbeat_seconds), tick)
+                self._answered.clear()
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(2 * (settings.poll_seconds + settings.heartbeat_seconds)):
+                        await self._answered.wait()
             if self.is_lost:
                 return
-
-    async def _wait_for_answer(self, most_seconds: float, tick: float) -> None:
-        """Return when the database has answered to what was asked from now on, or after some seconds."""
-        before, until = self._answer_count, time.monotonic() + most_seconds
-        while self._answer_count == before and time.monotonic() < until:
-            await asyncio.sleep(tick)
