@@ -14,7 +14,7 @@ from typing import BinaryIO
 
 from octasplat.engine.core.portable_names import FileNameError, check_name, quoted_name
 from octasplat.engine.core.scene_layout import FileRole, file_role, lay_out_scene
-from octasplat.service.intake.faults import raise_intake_error
+from octasplat.service.intake.faults import raise_intake_error, shown_name
 from octasplat.service.intake.upload_names import FileNames
 from octasplat.service.intake.zip_records import (
     DEFLATED,
@@ -245,19 +245,14 @@ def _scene_listing(records: list[ZipEntry], limits: ArchiveLimits) -> ArchiveLis
         _check_size(by_path[path], limits)
         taken_names.add(name)
     files = tuple(ArchiveFile(name, by_path[path]) for name, path in layout.files.items())
-    left_out = tuple(map(_shown_name, (*layout.left_out, *layout.ignored)))
-    listing = ArchiveListing(files, left_out, layout.notes, _shown_name(layout.folder))
+    left_out = tuple(map(shown_name, (*layout.left_out, *layout.ignored)))
+    listing = ArchiveListing(files, left_out, layout.notes, shown_name(layout.folder))
     if listing.size_bytes > limits.max_total_bytes:
         raise_intake_error(
             "archive-too-large",
             f"The archive unpacks to {listing.size_bytes} bytes; {limits.max_total_bytes} are allowed.",
         )
     return listing
-
-
-def _shown_name(name: str) -> str:
-    """Return a name with bytes that are not UTF-8 written as escapes."""
-    return name.encode("utf-8", "backslashreplace").decode()
 
 
 def _check_place(record: ZipEntry) -> None:

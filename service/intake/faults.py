@@ -6,6 +6,11 @@ from typing import NoReturn
 from octasplat.engine.core.errors import DatasetError
 
 
+def shown_name(name: str) -> str:
+    """Return a name with bytes that are not UTF-8 written as escapes."""
+    return name.encode("utf-8", "backslashreplace").decode()
+
+
 @dataclass(frozen=True)
 class IntakeFault:
     """One fault.
@@ -13,12 +18,17 @@ class IntakeFault:
     Attributes:
         code: stable name of the reason, e.g. ``name-traversal``.
         detail: one sentence that says what is wrong and what to do.
-        file: name of the file in the dataset or archive that it concerns, if it is one.
+        file: name of the file in the dataset or archive that it concerns, if it is one; bytes of it that are
+            not UTF-8 are written as escapes.
     """
 
     code: str
     detail: str
     file: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.file is not None:
+            object.__setattr__(self, "file", shown_name(self.file))
 
     @property
     def pointer(self) -> str:

@@ -23,6 +23,14 @@ router = APIRouter(prefix="/v1/jobs", tags=["progress"])
 After = Annotated[int, Query(ge=0, lt=1 << 62, description="`next` of the answer before.")]
 
 
+_EVENT_SCHEMA = {
+    "type": "object",
+    "properties": {name: {"type": "string"} for name in ("id", "event", "data")},
+    "required": ["data"],
+}
+"""Of each event, as OpenAPI 3.2 has it."""
+
+
 @router.get("/{job_id}/logs", responses=problem_responses(404))
 async def read_log(
     job_id: JobId, principal: Reader, service: ServiceDep, after: After = 0,
@@ -53,7 +61,7 @@ async def read_timeline(
     responses={
         200: {
             "description": "Server-sent events",
-            "content": {"text/event-stream": {"schema": {"type": "string"}}},
+            "content": {"text/event-stream": {"itemSchema": _EVENT_SCHEMA}},
         },
         204: {"description": "The job is over and everything was told"},
         **problem_responses(404),

@@ -134,6 +134,11 @@ def test_archive_inconsistent_structure_is_refused(local_storage: LocalStorage, 
     assert refusal(make(), local_storage) == code
 
 
+def test_refused_name_that_is_no_text_can_be_told(local_storage: LocalStorage) -> None:
+    data = build_zip(good(), ZipMember(b"\xf4\xea", b"x", flags=0, local={"flags": 0x15D}))
+    assert refusal(data, local_storage) == "archive-mismatch"
+
+
 def test_two_end_records_are_ambiguous(local_storage: LocalStorage) -> None:
     first = build_zip(good())
     hidden = struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, 1, 1, 0, 0, 0)

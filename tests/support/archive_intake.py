@@ -1,6 +1,7 @@
 """Archives given to the intake: what comes out of them, or the code that refuses them."""
 
 import io
+import json
 import struct
 
 import pytest
@@ -38,5 +39,6 @@ def refusal(data: bytes, storage: LocalStorage, limits: ArchiveLimits = LIMITS) 
         take(data, storage, limits)
     assert str(caught.value).endswith(".")
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 400
+    json.dumps([fault.as_dict() for fault in caught.value.faults], ensure_ascii=False).encode()  # can be told
     assert storage.remove_stale_uploads(-60) == 0  # nothing half-written is left
     return caught.value.code
