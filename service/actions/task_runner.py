@@ -60,8 +60,7 @@ class TaskRunner:
         while True:
             try:
                 await self._look_after_tasks()
-                if not self._service.is_draining:
-                    await self._begin_tasks()
+                await self._begin_tasks()
             except _DATABASE_ERRORS as error:
                 logger.info("not looking for tasks for a moment: %s", error)
             except Exception:
@@ -79,6 +78,8 @@ class TaskRunner:
         for kind, (work, shares) in self._kinds.items():
             while (count := self._count_running(kind)) < shares.max_running:
                 async with self._service.pool.connection() as connection:
+                    if self._service.is_draining:  # meanwhile
+                        return
                     task = await rows.claim_task(connection, kind, max_per_owner=shares.per_owner(count))
                 if task is None:
                     break

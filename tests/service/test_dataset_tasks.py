@@ -130,6 +130,7 @@ async def test_front_end_that_is_about_to_stop_begins_no_tasks(
     async with connect_service() as (http, service):
         dataset = await new_dataset(http)
         service.is_draining = True
+        await asyncio.sleep(0.5)  # a claim that was under way has ended
         async with service.pool.connection() as connection:
             task = await rows.add_task(connection, uuid.UUID(dataset.rpartition("/")[2]), "local", "commit")
         await asyncio.sleep(0.5)

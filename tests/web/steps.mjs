@@ -592,8 +592,13 @@ const steps = {
         await page.waitForSelector("#viewer[data-ready=yes]");
         const look = async () => {
             await page.evaluate(() => scrollTo(0, 0));
-            await page.waitForTimeout(500);
-            return brightness(page);
+            await page.waitForSelector("#viewer[data-rested=yes][data-drawn=all]");
+            for (let before = NaN; ;) { // until what is on the screen stays as it is
+                await page.waitForTimeout(300);
+                const { mean } = await brightness(page);
+                if (mean === before) return mean;
+                before = mean;
+            }
         };
         const looks = [await look()];
         for (const live of ["this", "learnt", ""]) {
@@ -602,7 +607,7 @@ const steps = {
             looks.push(await look());
             if (job.every && live) await shot(page, `live_${live}`, false);
         }
-        found.looks = looks.map(({ mean }) => mean);
+        found.looks = looks;
         await page.selectOption("#relight-integrator", job.by);
         if (job.preview) {
             await page.click("#relight [data-do=preview]");
