@@ -5,7 +5,7 @@ from jaxtyping import Float32, Int64
 
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.dataset import Dataset, DatasetView
-from octasplat.engine.train.sampling.pixel_sampler import Rectangles
+from octasplat.engine.dataset.view_tiles import Rectangles
 
 
 class BlockDataset:
@@ -21,7 +21,7 @@ class BlockDataset:
 
     def __init__(self, dataset: Dataset, trained_pixels: Rectangles) -> None:
         self._dataset = dataset
-        self.trained_pixels = trained_pixels
+        self.trained_pixels: Rectangles | None = trained_pixels
         self.views: tuple[DatasetView, ...] = dataset.views
         self.train_indices: Int64[np.ndarray, " t"] = np.unique(trained_pixels.view)
         self.test_indices: Int64[np.ndarray, " h"] = np.zeros(0, np.int64)

@@ -26,6 +26,7 @@ from octasplat.engine.core.errors import CancelledError
 from octasplat.engine.core.events import Noted
 from octasplat.engine.core.threads import use_threads
 from octasplat.engine.dataset import Dataset
+from octasplat.engine.dataset.view_tiles import Rectangles
 from octasplat.engine.gaussians.merge import with_sh_degree
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 from octasplat.engine.shading.protocol import ShadingModel
@@ -36,11 +37,7 @@ from octasplat.engine.train.initialization.initial_gaussians import initial_trai
 from octasplat.engine.train.loop.checkpoint import BestState
 from octasplat.engine.train.loop.state import TrainState, initial_state
 from octasplat.engine.train.sampling.batches import evaluation_background
-from octasplat.engine.train.sampling.pixel_sampler import (
-    Rectangles,
-    valid_pixel_fraction,
-    view_sizes_px,
-)
+from octasplat.engine.train.sampling.pixel_sampler import valid_pixel_fraction, view_sizes_px
 from octasplat.engine.train.shading_factory import ShadingOptions, make_shading
 from octasplat.engine.train.views.view_grids import estimate_untrained_exposures
 

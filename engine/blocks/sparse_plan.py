@@ -8,9 +8,9 @@ from jaxtyping import Bool, Float32, Float64, Int64
 
 from octasplat.engine.blocks.block_plan import MARGIN
 from octasplat.engine.blocks.partition import Box, cut_into_boxes, weighted_spread
-from octasplat.engine.blocks.pixel_selection import ViewTiles
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.dataset.model import DatasetModel
+from octasplat.engine.dataset.view_tiles import ViewTiles
 
 MAP_SIDE_PX, MAP_BORDER_PX = 800, 20
 

@@ -22,10 +22,12 @@ from octasplat.engine.dataset.ray_tables import (
     open_ray_tables,
     rows_per_block,
 )
+from octasplat.engine.dataset.region import Region, region_pixels
 from octasplat.engine.dataset.scene_split import SceneSplit, SplitRule, SplitSource, split_scene
 from octasplat.engine.dataset.split import evaluation_split
 from octasplat.engine.dataset.training_points import training_points
 from octasplat.engine.dataset.view_rays import ViewRays, as_int64, raise_for_pixels
+from octasplat.engine.dataset.view_tiles import Rectangles
 from octasplat.engine.dataset.views_file import ViewsRecord, views_record
 
 MaskUse = Literal["ignore", "alpha"]
@@ -56,6 +58,8 @@ class Dataset:
         origin_world: where all of it has its origin in the coordinates of the files, see
             :mod:`octasplat.engine.core.local_origin`.
         warnings: one sentence each on what is odd but usable.
+        region: the box that is trained in detail; None where all of the scene is.
+        trained_pixels: how often each pixel is drawn where there is a region; None stands for evenly.
         has_alpha: whether any pixel can have an alpha below 1.
         has_masks: whether any view has a mask.
         extent: radius of the training cameras, see :func:`octasplat.engine.dataset.model.scene_extent`.
@@ -74,6 +78,7 @@ class Dataset:
         masks: MaskUse = "ignore",
         near: float = 0.0,
         near_world: float | None = None,
+        region: Region | None = None,
     ) -> None:
         self.root: Path = model.root
         self.views: tuple[DatasetView, ...] = model.views
@@ -104,6 +109,12 @@ class Dataset:
         self._train_pixels: Int64[np.ndarray, " train"] = np.cumsum(
             self._view_rays.sizes[self.train_indices].prod(axis=1)
         )
+        self.region = None if region is None else region.with_origin(self.origin_world)
+        self.trained_pixels: Rectangles | None = None
+        if self.region is not None:
+            self.trained_pixels = region_pixels(
+                self._view_rays.sizes, self.train_indices, self.rays, self.region
+            )
 
     @classmethod
     def open(
@@ -126,6 +137,7 @@ class Dataset:
         split: SplitSource = "given",
         stored_split: Mapping[str, bool] | None = None,
         model: str | None = None,
+        region: Region | None = None,
     ) -> "Dataset":
         """Load a scene and decode its photographs into ``cache_dir``, or reuse those already cached there.
 
@@ -150,6 +162,7 @@ class Dataset:
             split: ``given`` holds out what the scene says, if it does; ``every`` does not ask it.
             stored_split: whether each view is held out by the run that goes on, see :class:`SplitRule`.
             model: which of several models of the scene to take, by its path below it or its number.
+            region: the box to train in detail; None trains all of the scene alike.
 
         Raises:
             DatasetError: something is missing, damaged or inconsistent.
@@ -169,7 +182,7 @@ class Dataset:
             check_views(views_record(scene, digests, parts.test_indices))
         cache = open_pixel_cache(scene, cache_dir, digests, threads=threads, progress=progress)
         tables = open_ray_tables(scene.cameras, cache_dir, max_table_bytes)
-        return cls(scene, cache, tables, split=parts, masks=masks, near=near)
+        return cls(scene, cache, tables, split=parts, masks=masks, near=near, region=region)
 
     @classmethod
     def open_for_evaluation(
@@ -221,7 +234,12 @@ class Dataset:
 
     @property
     def train_pixel_count(self) -> int:
-        """Return the number of pixels of all training views, including those of weight 0."""
+        """Return the number of pixels of all training views, including those of weight 0.
+
+        Where there is a region, pixels that are drawn less often count less.
+        """
+        if self.trained_pixels is not None:
+            return self.trained_pixels.of_views(self.train_indices).drawn_pixel_count
         return int(self._train_pixels[-1])
 
     def rays(

@@ -14,7 +14,9 @@ from octasplat.engine.core.threads import use_threads
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.dataset.camera_clearance import CameraClearance, camera_clearances
+from octasplat.engine.dataset.region import OUTSIDE_FREQUENCY
 from octasplat.engine.dataset.view_frusta import ViewFrusta
+from octasplat.engine.dataset.view_tiles import FULL_FREQUENCY, Rectangles
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.engine.gaussians.materials import reflective_fraction
 from octasplat.engine.gaussians.model import FlatGaussians
@@ -154,6 +156,8 @@ def _make_trainer(
         state = _first_state(run, config)
         if exposure_changes is not None:
             progress(Warned(f"{exposure_changes} That is learnt; exposure=false leaves it out."))
+        if dataset.trained_pixels is not None:
+            progress(Noted(_region_text(dataset, dataset.trained_pixels)))
         state.seconds = clock.seconds()  # the clock of the phase, the making of the first Gaussians included
     else:
         clock.add(state.seconds)  # time of earlier processes counts
@@ -171,6 +175,7 @@ def _make_trainer(
         threads=run.threads,
         should_stop=run.should_stop,
         min_scale=MinScale.of_views(dataset.viewpoints, dataset.train_indices, config.min_scale_px),
+        region=dataset.region,
         camera_clearance=zones if config.camera_clearance > 0 else None,
         view_frusta=frusta if _prunes_unseen(config.materials) else None,
         on_step=None
@@ -178,6 +183,16 @@ def _make_trainer(
         else lambda done, tracer: on_step(done, dataset, tracer, trainer.shading, trainer.state.gaussians),
     )
     return trainer
+
+
+def _region_text(dataset: Dataset, trained_pixels: Rectangles) -> str:
+    """Return a sentence on the pixels that see the region."""
+    chosen = trained_pixels.of_views(dataset.train_indices)
+    seeing = chosen.of_frequency(FULL_FREQUENCY).pixel_count
+    return (
+        f"The region is seen by {seeing / 1e6:.1f} of {chosen.pixel_count / 1e6:.1f} million pixels; the "
+        f"others are drawn {FULL_FREQUENCY // OUTSIDE_FREQUENCY} times less often."
+    )
 
 
 def _warn_of_useless_materials(run: ReconstructionRun) -> None:

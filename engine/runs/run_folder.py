@@ -13,6 +13,7 @@ from octasplat.engine.core.events import EventListener, PhaseProgress, Warned
 from octasplat.engine.core.local_origin import Origin
 from octasplat.engine.dataset import Dataset, load_dataset_model
 from octasplat.engine.dataset.camera_clearance import CameraClearance
+from octasplat.engine.dataset.region import Region
 from octasplat.engine.dataset.scene_split import SplitRule
 from octasplat.engine.dataset.view_frusta import ViewFrusta
 from octasplat.engine.dataset.views_file import SplitViewpoints, ViewsRecord, read_views, scene_viewpoints
@@ -206,6 +207,13 @@ def found_model_folder(output: Path) -> Path | None:
     return None
 
 
+def _region(config: ReconstructionConfig) -> Region | None:
+    if config.region is None:
+        return None
+    # patches for SSIM fit into tiles
+    return Region(config.region, config.train.ssim_patch_side if config.train.loss.ssim > 0 else 1)
+
+
 def open_run_dataset(
     scene: Path,
     output: Path,
@@ -249,6 +257,7 @@ def open_run_dataset(
         check_views=check_views,
         near=config.train.near,
         origin_world=run_origin(output),
+        region=_region(config),
         threads=threads,
         progress=lambda done, total: progress(PhaseProgress("load", done, total)),
     )

@@ -5,13 +5,13 @@ import numpy as np
 from octasplat.engine.blocks.pixel_selection import (
     MIN_CONTRIBUTION,
     MIN_FREQUENCY,
-    ViewTiles,
     seen_pixels,
     select_pixels,
 )
+from octasplat.engine.dataset.view_tiles import FULL_FREQUENCY, Rectangles, ViewTiles
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import TraceSettings
-from octasplat.engine.train.sampling.pixel_sampler import FULL_FREQUENCY, PixelSampler, Rectangles
+from octasplat.engine.train.sampling.pixel_sampler import PixelSampler
 from tests.support.planar_dataset import PlanarDataset
 
 

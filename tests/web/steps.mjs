@@ -417,6 +417,13 @@ const steps = {
             await other.check("#edit [name=clean]");
             await other.waitForTimeout(800);
         });
+        // The same box for a new training: the form has it, and shows it.
+        const again = await page.context().newPage();
+        await again.goto(new URL(await page.getAttribute("#edit-region", "href"), job.url).href);
+        await again.waitForFunction(() => document.querySelector("[data-path=region]")?.value);
+        found.region = await again.inputValue("[data-path=region]");
+        found.regionShown = await again.isVisible("[data-path=region]");
+        await again.close();
         await page.click("#edit [value=crop]");
         await page.waitForURL((url) => !url.pathname.endsWith(job.job) && url.pathname.startsWith("/jobs/"));
         found.job = page.url().split("/").pop();

@@ -118,6 +118,9 @@ def test_result_is_measured_annotated_and_cropped(
     assert found["cropped"]["kept"] == kept.sum() < len(scene)
     assert found["said"].startswith(f"{kept.sum()} Gaussians stay; {(~kept).sum()} outside the box")
     assert found["differs"] > 1
+    region = np.array(found["region"].split(), float)
+    np.testing.assert_allclose(region, queued["options"]["box"], rtol=1e-4, atol=1e-4)
+    assert found["regionShown"]
     notes = service.request("GET", f"/v1/jobs/{result}")["view_notes"]
     assert [note["text"] for note in notes] == ["the middle <b>"] and len(notes[0]["camera"]) == 6
 

@@ -8,6 +8,7 @@ from math import comb
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
+from octasplat.engine.dataset.region import Region
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 from octasplat.engine.trace.protocol import GaussianGradients
 from octasplat.engine.train.config import McmcConfig
@@ -52,11 +53,16 @@ class McmcDensifier:
     (``relocate_low_weight_below``), in rounds, to where the error is seen, and share the area there: smaller
     ones are what is missing.
 
+    Where there is a region, places in it are chosen before others that score the same.
+
     Not done: the paper's noise on the means; the copies are scattered instead.
     """
 
-    def __init__(self, config: McmcConfig, *, iterations: int, max_gaussians: int) -> None:
+    def __init__(
+        self, config: McmcConfig, *, iterations: int, max_gaussians: int, region: Region | None = None
+    ) -> None:
         self._config = config
+        self._region = region
         self.wants_errors = config.error_power > 0 or config.relocate_low_weight_below > 0
         self._stop = int(config.stop_fraction * iterations)
         self._cap = max_gaussians
@@ -90,15 +96,16 @@ class McmcDensifier:
         config, count = self._config, len(gaussians)
         opacities = gaussians.opacities.astype(np.float64)
         alive = opacities > config.dead_opacity
+        preference = 1.0 if self._region is None else self._region.preference(gaussians.means_world)
         errors, weights = self._errors, self._weights
         self._reset_sums(count)
         if not alive.any():
             return gaussians, adam
         if self._relocates_low_weight(count) and len(weights) == count and errors.any():
-            return self._relocate(gaussians, adam, alive, errors, weights, rng)
-        score = np.where(alive, opacities, 0.0)
+            return self._relocate(gaussians, adam, alive, errors * preference, weights, rng)
+        score = np.where(alive, opacities * preference, 0.0)
         if config.error_power > 0 and len(errors) == count and errors.any():
-            score = np.where(alive, errors.astype(np.float64) ** config.error_power, 0.0)
+            score = np.where(alive, errors.astype(np.float64) ** config.error_power * preference, 0.0)
         dead = np.flatnonzero(~alive)
         born = max(0, min(self._cap - count, round(config.growth * count)))
         wanted = len(dead) + born

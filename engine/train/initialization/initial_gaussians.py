@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.dataset import Dataset
+from octasplat.engine.dataset.region import Region
 from octasplat.engine.gaussians.frames import frames_from_normals, quaternions_from_matrices
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
 from octasplat.engine.shading.material_settings import MaterialSettings
@@ -118,6 +119,7 @@ def initial_gaussians(
             rng=rng,
             plane_points=options.normal_neighbors,
             most_angles=max_angles,
+            region=dataset.region,
         )
     # --- too few sparse points: random pixels at random depths ---
     view, y, x = dataset.sample_pixels(rng, limit)
@@ -182,19 +184,24 @@ def gaussians_from_points(
     rng: np.random.Generator,
     plane_points: int = 8,
     most_angles: Float64[np.ndarray, " n"] | None = None,
+    region: Region | None = None,
 ) -> FlatGaussians:
     """Return flat Gaussians on sparse points.
 
     The scales are the mean distance to the three nearest points; the normal is that of the plane through
     the ``plane_points`` nearest where they lie on one, else it looks at the cameras. More than ``limit``
     points are thinned at random. ``most_angles`` are the largest scales as seen from the nearest camera,
-    radians; None for ``MAX_ANGULAR_SIZE``.
+    radians; None for ``MAX_ANGULAR_SIZE``. Points of a region are kept before others.
     """
     centre = np.median(camera_centres_world, axis=0)
     far = np.linalg.norm(xyz_world - centre, axis=1) > MAX_DISTANCE * extent
     keep = np.flatnonzero(~far & np.isfinite(xyz_world).all(axis=1))
     if len(keep) > limit:  # points that are matching errors should not take the place of others
-        keep = np.sort(rng.choice(keep, limit, replace=False))
+        likelihood = None
+        if region is not None:
+            preference = region.preference(xyz_world[keep]).astype(np.float64)
+            likelihood = preference / preference.sum()
+        keep = np.sort(rng.choice(keep, limit, replace=False, p=likelihood))
     points = xyz_world[keep].astype(np.float64)
     count = len(points)
     if count == 0:

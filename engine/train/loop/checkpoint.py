@@ -39,7 +39,10 @@ _DAMAGE = (
 def run_fingerprint(dataset: Dataset, config: TrainConfig) -> str:
     """Return a digest of the settings and the photographs that decide every byte of a training."""
     # settings under their former names, so that older checkpoints keep their digest
-    text = json.dumps([dump_with_former_settings(config), dataset.views_record.fingerprint()])
+    parts: list[object] = [dump_with_former_settings(config), dataset.views_record.fingerprint()]
+    if dataset.region is not None:
+        parts.append(dataset.region.corners_world)
+    text = json.dumps(parts)
     return hashlib.sha256(text.encode()).hexdigest()
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from octasplat.engine.core.errors import CancelledError, TrainingError
 from octasplat.engine.core.events import CheckpointWritten, EventListener, TrainingProgress, Warned
 from octasplat.engine.dataset.camera_clearance import CameraClearance
+from octasplat.engine.dataset.region import Region
 from octasplat.engine.dataset.view_frusta import ViewFrusta
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.morton import morton_order
@@ -57,6 +58,7 @@ class Trainer:
         camera_clearance: zones around cameras in which no Gaussian stays, whatever the strategy does.
         view_frusta: frusta of the views; no Gaussian stays outside of all of them.
         fixed_gaussians: Gaussians that are seen, too, and stay as they are; not with a tracer that is given.
+        region: where Gaussians are added first; None for everywhere alike.
         tracer: anything that follows the protocol; None takes the one that the configuration names.
         shading: anything that follows the protocol; None takes the one that the configuration asks for.
         on_step: called after each iteration with the number of those done and the tracer as it is then; it
@@ -88,6 +90,7 @@ class Trainer:
         camera_clearance: CameraClearance | None = None,
         view_frusta: ViewFrusta | None = None,
         fixed_gaussians: FlatGaussians | None = None,
+        region: Region | None = None,
         tracer: Tracer | None = None,
         shading: ShadingModel | None = None,
         on_step: Callable[[int, Tracer], None] | None = None,
@@ -125,6 +128,7 @@ class Trainer:
             config.densify,
             iterations=self.schedule.iterations,
             max_gaussians=max_gaussian_count(config, pixels, valid),
+            region=region,
         )
         if config.materials.learn and config.materials.normal_propagation:
             propagate = material_shading(config.materials.recipe).propagate_normals

@@ -1,7 +1,6 @@
 """What training needs of a dataset, and pixels drawn from its views: singly, in ray patches, or in blocks."""
 
 import math
-from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -10,12 +9,11 @@ from jaxtyping import Float32, Int64
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.dataset import DatasetView
+from octasplat.engine.dataset.view_tiles import Rectangles
 from octasplat.engine.shading.ray_patches import morton_cells
 
 GOLDEN_RATIO = (math.sqrt(5) - 1) / 2
 """Its multiples fill the unit interval evenly, however many there are."""
-FULL_FREQUENCY = 8
-"""Parts in which it is counted how often pixels of a rectangle are drawn."""
 VALID_PIXEL_SAMPLES = 20_000
 """Pixels by which the share of valid ones is estimated, always the same: it is right to 0.4 %."""
 
@@ -51,59 +49,23 @@ class TrainingData(PixelSource, Protocol):
     extent: float
 
 
-@dataclass(frozen=True, eq=False)
-class Rectangles:
-    """Rectangles of pixels of some views, none of which overlap; a view may have several.
-
-    Attributes:
-        view: index of the view of each, ascending.
-        corner_px: x and y of the first pixel.
-        size_px: width and height, 1 at least.
-        frequency: how often a pixel of each is drawn, in parts of :data:`FULL_FREQUENCY`, 1 at least; none
-            given stands for all of them.
-    """
-
-    view: Int64[np.ndarray, " k"]
-    corner_px: Int64[np.ndarray, "k 2"]
-    size_px: Int64[np.ndarray, "k 2"]
-    frequency: Int64[np.ndarray, " k"] = field(default_factory=lambda: np.zeros(0, np.int64))
-
-    def __post_init__(self) -> None:
-        if len(self.frequency) != len(self.view):
-            object.__setattr__(self, "frequency", np.full(len(self.view), FULL_FREQUENCY))
-
-    def __len__(self) -> int:
-        return len(self.view)
-
-    @property
-    def pixel_count(self) -> int:
-        """Return the number of pixels in all of them."""
-        return int(self.size_px.prod(axis=1).sum())
-
-    @property
-    def drawn_pixel_count(self) -> int:
-        """Return how many pixels that are drawn at full frequency would take as long, 1 at least."""
-        return max(1, int((self.size_px.prod(axis=1) * self.frequency).sum()) // FULL_FREQUENCY)
-
-    def of_views(self, views: Int64[np.ndarray, " v"]) -> "Rectangles":
-        """Return those of some views."""
-        is_kept = np.isin(self.view, views)
-        return Rectangles(
-            self.view[is_kept], self.corner_px[is_kept], self.size_px[is_kept], self.frequency[is_kept]
-        )
-
-
 @runtime_checkable
 class PartialTrainingData(TrainingData, Protocol):
-    """Photographs of which only some pixels are trained on."""
+    """Photographs of which only some pixels may be trained on; all of them where none are named."""
 
-    trained_pixels: Rectangles
+    trained_pixels: Rectangles | None
+
+
+def trained_pixels(dataset: TrainingData) -> Rectangles | None:
+    """Return the pixels that are trained on; None stands for all of them."""
+    return dataset.trained_pixels if isinstance(dataset, PartialTrainingData) else None
 
 
 def pixel_sampler(dataset: TrainingData, view_indices: Int64[np.ndarray, " v"]) -> "PixelSampler":
     """Return a sampler of some views: of all their pixels, or of those that are trained on."""
-    if isinstance(dataset, PartialTrainingData):
-        return PixelSampler.of_rectangles(dataset.trained_pixels.of_views(view_indices))
+    trained = trained_pixels(dataset)
+    if trained is not None:
+        return PixelSampler.of_rectangles(trained.of_views(view_indices))
     return PixelSampler(view_indices, view_sizes_px(dataset))
 
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.dataset import Camera, DatasetView
-from octasplat.engine.train.sampling.pixel_sampler import TrainingData
+from octasplat.engine.train.sampling.pixel_sampler import TrainingData, trained_pixels
 from octasplat.engine.train.views.image_alignment import RigidMotion
 
 FIT_ROUNDS = 3
@@ -44,6 +44,7 @@ class CorrectedDataset:
         self.test_indices: Int64[np.ndarray, " h"] = given.test_indices
         self.has_alpha = given.has_alpha
         self.extent = given.extent
+        self.trained_pixels = trained_pixels(given)
         self.set_corrections(np.zeros((len(given.views), 6)))
 
     def set_corrections(self, corrections: Float64[np.ndarray, "v 6"]) -> None:

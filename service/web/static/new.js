@@ -14,6 +14,12 @@ let scenes = null, upload = null, choice = 0; // several scenes become a job eac
 // By their attributes: a field of the form has the id "dataset".
 const kind = form.getAttribute("data-kind"), given = form.getAttribute("data-given");
 if (given) fillOptions(form, JSON.parse(given));
+const region = new URLSearchParams(location.hash.slice(1)).get("region"); // a box from the 3D view of another job
+if (region) {
+    const field = form.querySelector("[data-path=region]");
+    field.value = region.replaceAll(",", " ");
+    for (let fold = field.closest("details"); fold; fold = fold.parentElement.closest("details")) fold.open = true;
+}
 followPreset(form);
 const estimateAnew = showEstimates(form, find("estimate"), () => ({ scene: largest(), dataset: known?.value, queue: find("queue")?.value ?? "cpu" }));
 

@@ -76,6 +76,11 @@ export class EditPanel {
         this.form.querySelector(".clean-fields").hidden = !clean;
         this.form.querySelector("[value=crop]").disabled = !box;
         this.form.querySelector("[value=clean]").disabled = !clean;
+        const region = this.form.querySelector("#edit-region"); // not there for results of other jobs
+        if (region) {
+            region.hidden = !box;
+            if (box) region.href = `${region.dataset.new}#region=${this.inFile(box).map((value) => value.toPrecision(5)).join(",")}`;
+        }
         this.viewer.overlay.box = box;
         this.showNumbers();
         this.viewer.wake();
@@ -89,6 +94,11 @@ export class EditPanel {
         this.viewer.edit(isOpen ? { box, clean } : { box: null, clean: null }, isOpen ? this.show : "all");
     }
 
+    /** A box in the coordinates of the user. */
+    inFile(box) {
+        return box.map((value, k) => value + this.origin[k % 3]);
+    }
+
     tell({ counts, kept }) {
         const reasons = Object.entries(counts).filter(([, number]) => number).map(([reason, number]) => `${thousands(number)} ${WORDS[reason]}`);
         this.state.textContent = `${thousands(kept)} Gaussians stay${reasons.length ? `; ${reasons.join(", ")}` : ""}.`;
@@ -98,7 +108,7 @@ export class EditPanel {
     async queue(kind) {
         const { box, clean } = this.wanted(), fault = this.form.querySelector(".fault");
         fault.hidden = true;
-        const options = kind === "crop" ? { box: box.map((value, k) => value + this.origin[k % 3]) } : clean;
+        const options = kind === "crop" ? { box: this.inFile(box) } : clean;
         try {
             location.href = `/jobs/${await queueJob({ kind, source_id: this.source, options }, crypto.randomUUID?.() ?? String(Math.random()))}`;
         } catch (error) {
