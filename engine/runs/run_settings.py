@@ -97,7 +97,7 @@ class RunSettings(BaseModel):
         description="Two points and the metres between them, which decide the scale; a point is a control "
         "point, a photograph, the number of a sparse point, or x,y,z.",
     )
-    region: Annotated[Box | None, Spelling(metavar="X0 Y0 Z0 X1 Y1 Z1"), ADVANCED] = Field(
+    region: Annotated[Box | None, Unit("world"), Spelling(metavar="X0 Y0 Z0 X1 Y1 Z1"), ADVANCED] = Field(
         None,
         description="Two corners of a box to train in detail, smallest coordinates first, in the coordinates "
         "of the COLMAP model; what lies around stays coarse. By default all of the scene is trained alike.",

@@ -93,6 +93,7 @@ def reconstruct(
     georeference: Literal["auto", "gps", "off"] | None = None,
     control_points: str | None = None,
     known_length: str | None = None,
+    region: Sequence[float] | None = None,
     minutes: float | None = None,
     exports: Sequence[str] | None = None,
     materials: bool = False,
@@ -156,6 +157,9 @@ def reconstruct(
             or control_points.csv where there is one.
         known_length: Two points and the metres between them, which decide the scale; a point is a
             control point, a photograph, the number of a sparse point, or x,y,z.
+        region: Two corners of a box to train in detail, smallest coordinates first, in the coordinates
+            of the COLMAP model; what lies around stays coarse. By default all of the scene is trained
+            alike.
         minutes: Time in which the training is to end, which decides its iterations and Gaussians by the
             pace of the machine that begins it; by default the other settings do.
         exports: Files to write besides scene.ply; their names say the format. Default: ('viewer.glb',
@@ -215,6 +219,7 @@ def reconstruct(
             "georeference": georeference,
             "control_points": control_points,
             "known_length": known_length,
+            "region": region,
             "minutes": minutes,
             "exports": exports,
             "materials": materials,
@@ -256,6 +261,7 @@ def estimate(
     georeference: Literal["auto", "gps", "off"] | None = None,
     control_points: str | None = None,
     known_length: str | None = None,
+    region: Sequence[float] | None = None,
     minutes: float | None = None,
     exports: Sequence[str] | None = None,
     materials: bool = False,
@@ -312,6 +318,9 @@ def estimate(
             or control_points.csv where there is one.
         known_length: Two points and the metres between them, which decide the scale; a point is a
             control point, a photograph, the number of a sparse point, or x,y,z.
+        region: Two corners of a box to train in detail, smallest coordinates first, in the coordinates
+            of the COLMAP model; what lies around stays coarse. By default all of the scene is trained
+            alike.
         minutes: Time in which the training is to end, which decides its iterations and Gaussians by the
             pace of the machine that begins it; by default the other settings do.
         exports: Files to write besides scene.ply; their names say the format. Default: ('viewer.glb',
@@ -357,6 +366,7 @@ def estimate(
             "georeference": georeference,
             "control_points": control_points,
             "known_length": known_length,
+            "region": region,
             "minutes": minutes,
             "exports": exports,
             "materials": materials,
@@ -398,6 +408,7 @@ def plan(
     georeference: Literal["auto", "gps", "off"] | None = None,
     control_points: str | None = None,
     known_length: str | None = None,
+    region: Sequence[float] | None = None,
     minutes: float | None = None,
     exports: Sequence[str] | None = None,
     materials: bool = False,
@@ -460,6 +471,9 @@ def plan(
             or control_points.csv where there is one.
         known_length: Two points and the metres between them, which decide the scale; a point is a
             control point, a photograph, the number of a sparse point, or x,y,z.
+        region: Two corners of a box to train in detail, smallest coordinates first, in the coordinates
+            of the COLMAP model; what lies around stays coarse. By default all of the scene is trained
+            alike.
         minutes: Time in which the training is to end, which decides its iterations and Gaussians by the
             pace of the machine that begins it; by default the other settings do.
         exports: Files to write besides scene.ply; their names say the format. Default: ('viewer.glb',
@@ -508,6 +522,7 @@ def plan(
             "georeference": georeference,
             "control_points": control_points,
             "known_length": known_length,
+            "region": region,
             "minutes": minutes,
             "exports": exports,
             "materials": materials,
