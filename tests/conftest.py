@@ -6,7 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import jaxtyping
 import numpy as np
 import pytest
 
@@ -37,7 +36,7 @@ def checked_modules() -> list[str]:
     ]
 
 
-jaxtyping.install_import_hook(checked_modules(), f"{shape_checks.__name__}.check")
+shape_checks.install(checked_modules())
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -49,6 +48,11 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """What takes long comes first, so that no process is left with it when the others have nothing to do."""
     items.sort(key=lambda item: LONGEST_FIRST.get(item.path.name, len(LONGEST_FIRST)))
+
+
+def pytest_runtest_setup() -> None:
+    """The first calls of each function are checked in each test."""
+    shape_checks.begin_test()
 
 
 @pytest.fixture(scope="session")

@@ -4,10 +4,9 @@ import json
 import random
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
+from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 
 import numba
@@ -24,25 +23,15 @@ from octasplat.engine.core.events import CheckpointWritten, Event
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.pipeline import reconstruct
 from octasplat.engine.runs.config import ReconstructionConfig, resolve_config
+from tests.support.killable_run import start_run
 from tests.support.tiny_dataset import make_tiny_dataset
 
 pytestmark = pytest.mark.heavy
 
 ITERATIONS, EVERY = 300, 25
-RUN = """
-import sys
-from pathlib import Path
-from octasplat.engine.runs.config import ReconstructionConfig
-from octasplat.engine.pipeline import reconstruct
-scene, output, config, threads = sys.argv[1:]
-reconstruct(
-    Path(scene),
-    Path(output),
-    ReconstructionConfig.model_validate_json(config),
-    resume=True,
-    threads=int(threads),
-)
-"""
+FILES = ["octagons.ply", "octagons.obj", "octagons.glb"]
+WITH_SURFACE = {"exports": [*FILES, "viewer.glb", "surface.glb"]}
+"""All that a run exports by itself; the surface takes three times as long as the rest of the run."""
 
 
 def make_config(**assignments: object) -> ReconstructionConfig:
@@ -62,6 +51,7 @@ def make_config(**assignments: object) -> ReconstructionConfig:
         "rebuild_every": EVERY,
         "checkpoint_every": EVERY,
         "probe_rays": 512,
+        "exports": FILES,
         **assignments,
     }
     return resolve_config("standard", assignments=[f"{k}={json.dumps(v)}" for k, v in values.items()])
@@ -83,6 +73,13 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def whole_run(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same run without an interruption, on one thread."""
     return reconstruct(scene, tmp_path_factory.mktemp("whole") / "run", make_config(), threads=1)
+
+
+@pytest.fixture(scope="module")
+def surface_run(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same with all that a run exports."""
+    output = tmp_path_factory.mktemp("surface") / "run"
+    return reconstruct(scene, output, make_config(**WITH_SURFACE), threads=1)
 
 
 def results(run: Path) -> dict[str, bytes]:
@@ -112,33 +109,23 @@ def lines_of(run: Path) -> list[str]:
     return events.read_text(encoding="utf-8", errors="replace").splitlines() if events.exists() else []
 
 
-def start(scene: Path, run: Path, threads: int) -> "subprocess.Popen[bytes]":
-    return subprocess.Popen(
-        [sys.executable, "-c", RUN, str(scene), str(run), make_config().model_dump_json(), str(threads)],
-        cwd=Path(__file__).parents[1],
-        stderr=subprocess.PIPE,
-    )
-
-
-def kill_when(process: "subprocess.Popen[bytes]", ready: Callable[[], bool], delay: float) -> bool:
+def kill_when(process: ForkServerProcess, ready: Callable[[], bool], delay: float) -> bool:
     """Kill a run ``delay`` seconds after ``ready``; False if it ended by itself before that."""
     deadline = time.monotonic() + 120
-    while not ready() and process.poll() is None:
+    while not ready() and process.is_alive():
         assert time.monotonic() < deadline, "the run does not get on"
         time.sleep(0.002)
     time.sleep(delay)
-    ended = process.poll() is not None
-    if not ended:
-        process.send_signal(signal.SIGKILL)
-    _, errors = process.communicate()
-    assert not ended or process.returncode == 0, errors.decode()
-    return not ended
+    process.kill()  # which does nothing to one that has ended
+    process.join()
+    assert process.exitcode in (0, -signal.SIGKILL)
+    return process.exitcode != 0
 
 
-def finish(scene: Path, run: Path, threads: int) -> None:
-    process = start(scene, run, threads)
-    _, errors = process.communicate(timeout=180)
-    assert process.returncode == 0, errors.decode()
+def finish(scene: Path, run: Path, config: ReconstructionConfig, threads: int) -> None:
+    process = start_run(scene, run, config.model_dump_json(), threads)
+    process.join(timeout=180)
+    assert process.exitcode == 0
 
 
 def test_killed_while_training_again_and_again(scene: Path, whole_run: Path, tmp_path: Path) -> None:
@@ -146,7 +133,7 @@ def test_killed_while_training_again_and_again(scene: Path, whole_run: Path, tmp
     run = tmp_path / "run"
     kills = 0
     for attempt in range(5):
-        process = start(scene, run, threads=1 + attempt % 2)
+        process = start_run(scene, run, make_config().model_dump_json(), threads=1 + attempt % 2)
         enough = len(lines_of(run)) + moments.randint(1, 14)
         alive = kill_when(
             process, lambda enough=enough: len(lines_of(run)) >= enough, moments.uniform(0, 0.08)
@@ -155,19 +142,19 @@ def test_killed_while_training_again_and_again(scene: Path, whole_run: Path, tmp
         if not alive:
             break
     assert kills >= 3
-    finish(scene, run, threads=2)
+    finish(scene, run, make_config(), threads=2)
     assert_same(run, whole_run)
     iterations = [json.loads(line).get("iteration", 0) for line in lines_of(run) if line.startswith("{")]
     assert max(iterations) == ITERATIONS
 
 
 @pytest.mark.parametrize("stage", ["load", "evaluate", "export"])
-def test_killed_in_another_stage(scene: Path, whole_run: Path, tmp_path: Path, stage: str) -> None:
+def test_killed_in_another_stage(scene: Path, surface_run: Path, tmp_path: Path, stage: str) -> None:
     moments = random.Random(stage)
-    run = tmp_path / "run"
+    run, config = tmp_path / "run", make_config(**WITH_SURFACE)
     if stage != "load":
         # Everything up to the stage is there already, as it would be.
-        shutil.copytree(whole_run, run)
+        shutil.copytree(surface_run, run)
         (run / "events.jsonl").write_text("")
         leftovers = ["octagons.obj", "octagons.glb"] + (
             ["metrics.json", "report.html"] if stage == "evaluate" else []
@@ -182,16 +169,17 @@ def test_killed_in_another_stage(scene: Path, whole_run: Path, tmp_path: Path, s
     for _ in range(2):
         before = len(lines_of(run))
         killed += kill_when(
-            start(scene, run, threads=2),
+            start_run(scene, run, config.model_dump_json(), threads=2),
             lambda before=before: begun() and len(lines_of(run)) > before,
             moments.uniform(0, 0.1),
         )
-    finish(scene, run, threads=1)
-    assert_same(run, whole_run)
+    finish(scene, run, config, threads=1)
+    assert_same(run, surface_run)
 
 
-def test_pipeline_independent_of_threads(scene: Path, whole_run: Path, tmp_path: Path) -> None:
-    assert_same(reconstruct(scene, tmp_path / "run", make_config(), threads=2), whole_run)
+def test_pipeline_independent_of_threads(scene: Path, surface_run: Path, tmp_path: Path) -> None:
+    run = reconstruct(scene, tmp_path / "run", make_config(**WITH_SURFACE), threads=2)
+    assert_same(run, surface_run)
 
 
 def test_pipeline_stopped_run_resumes_to_same_bytes(scene: Path, whole_run: Path, tmp_path: Path) -> None:
