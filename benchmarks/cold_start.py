@@ -33,6 +33,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "stage init": ("stage", "init", "{run}", "-o", "{out}.toml"),
     "render --stage": ("render", "{run}", "-o", "{out}", "--stage", "{stage}"),
     "clean": ("clean", "{run}", "-o", "{out}.ply", "--min-opacity", "0.01"),
+    "simplify": ("simplify", "{run}", "-o", "{out}.ply", "-n", "1000"),
     "transform": ("transform", "{run}", "-o", "{out}.ply", "--scale", "2"),
 }
 """Commands by the name that the table has, with the places of their files."""

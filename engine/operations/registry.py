@@ -26,6 +26,7 @@ _MODULES = {
     "crop": "crop",
     "merge": "merge",
     "clean": "clean",
+    "simplify": "simplify",
 }
 """Module of each verb, in the order in which users meet them."""
 

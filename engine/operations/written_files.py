@@ -26,7 +26,9 @@ _TABLE = (
     "CREATE TABLE IF NOT EXISTS written "
     "(path TEXT PRIMARY KEY, kind TEXT NOT NULL, size INTEGER NOT NULL, time_ns INTEGER NOT NULL)"
 )
-_SCENES = ("clean", "crop", "deform", "edit", "export", "import", "material", "merge", "transform")
+_SCENES = (
+    "clean", "crop", "deform", "edit", "export", "import", "material", "merge", "simplify", "transform",
+)  # fmt: skip
 _KINDS = {**dict.fromkeys(_SCENES, "scene"), "render": "pictures", "relight": "pictures"}
 """Verbs that write the same kind of output; that of each other verb is its own."""
 _FOR_EDITS = "stage-init"

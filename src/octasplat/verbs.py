@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from octasplat.engine.operations.plan import PlanResult
     from octasplat.engine.operations.relight import RelightResult
     from octasplat.engine.operations.render import RenderResult
+    from octasplat.engine.operations.simplify import SimplifyResult
     from octasplat.engine.operations.stage_init import StageInitResult
     from octasplat.engine.operations.surface import SurfaceResult
     from octasplat.engine.operations.transform import TransformResult
@@ -1720,6 +1721,46 @@ def clean(
             "output": output,
             "dry_run": dry_run,
         },
+        progress,
+        should_stop,
+        threads,
+    )
+
+
+@names_checked
+def simplify(
+    source: PathLike,
+    output: PathLike,
+    *,
+    count: int,
+    overwrite: bool = False,
+    progress: EventListener | None = None,
+    should_stop: Callable[[], bool] = never_stop,
+    threads: int = 0,
+) -> "SimplifyResult":
+    """Merge neighbors until so many Gaussians are left.
+
+    Args:
+        source: The scene to read: a file of any format, or the folder of a run.
+        output: The scene to write; the suffix says in which format. Of a run, a name without suffix
+            writes a folder that is a run again, with what of it stays valid.
+        count: Number of Gaussians to leave; a scene that has no more stays as it is.
+        overwrite: Replace files that are there already, too, which are not of an earlier run of this
+            command or were changed since. What is read is never replaced.
+        progress: told each event; by default they are logged, or shown in a notebook.
+        should_stop: asked now and then; True ends the work with ``CancelledError``.
+        threads: number of threads; 0 takes all cores. The result does not depend on it.
+
+    Raises:
+        OctasplatError: something cannot be read, done or written; the text says what.
+
+    >>> import octasplat as osp
+    >>> osp.simplify("scene.ply", "small.ply", count=300).kept, len(osp.load("small.ply"))
+    (300, 300)
+    """
+    return run_operation(
+        "simplify",
+        {"overwrite": overwrite, "source": source, "output": output, "count": count},
         progress,
         should_stop,
         threads,

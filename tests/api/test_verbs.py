@@ -80,6 +80,7 @@ def test_output_over_input_scene_is_refused(verb: str, scene_file: Path, finishe
     [
         ("crop", {"where": "opacity > 0.5"}),
         ("clean", {}),
+        ("simplify", {"count": 300}),
         ("transform", {"scale": 2.0}),
         ("material", {"set": {"roughness": 0.3}}),
         ("import_", {}),

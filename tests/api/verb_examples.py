@@ -92,6 +92,11 @@ True
 >>> cleaned.count, cleaned.kept + cleaned.faint
 (1200, 1200)
 """,
+    "simplify": """
+>>> import octasplat as osp
+>>> osp.simplify("scene.ply", "small.ply", count=300).kept, len(osp.load("small.ply"))
+(300, 300)
+""",
     "reconstruct": """
 >>> import octasplat as osp
 >>> def stop_early(step):

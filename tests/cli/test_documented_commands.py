@@ -20,7 +20,8 @@ from tests.support.small_run import RUN_OPTIONS
 
 VERBS = {
     "clean", "config", "crop", "deform", "demo", "edit", "estimate", "evaluate", "export", "import", "info",
-    "material", "merge", "plan", "reconstruct", "relight", "render", "stage", "surface", "transform",
+    "material", "merge", "plan", "reconstruct", "relight", "render", "simplify", "stage",
+    "surface", "transform",
 }  # fmt: skip
 """What runs here; the commands of the service have tests of their own."""
 PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md")), DOCS / "opening" / "blender.md"]

@@ -28,6 +28,7 @@ ONE_IMAGE = ("--camera", "0", "0", "-4", "--width", "32", "--height", "24")
 READS = {
     "crop": ("crop", "scene.ply", "--where", "opacity > 0", "-o", "scene.ply"),
     "clean": ("clean", "scene.ply", "-o", "scene.ply"),
+    "simplify": ("simplify", "scene.ply", "-n", "50", "-o", "scene.ply"),
     "transform": ("transform", "run", "--scale", "2", "-o", "run/scene.ply"),
     "transform's matrix": ("transform", "scene.ply", "--matrix", "matrix.txt", "-o", "matrix.ply"),
     "merge": ("merge", "scene.ply", "run", "-o", "run/scene.ply"),

@@ -97,6 +97,7 @@ async def test_every_kind_of_job_succeeds_in_its_own_process(
         assert "surface.glb" in await jobs.names(await run("surface", surface, whole))
         await run("crop", {"where": "x > -100"}, whole)
         await run("clean", {"min_opacity": 0.01}, whole)
+        await run("simplify", {"count": 20}, whole)
         await run("transform", {"scale": 2}, whole)
         mesh = await jobs.read(whole, "mesh.ply")
         await run("edit", {"meshes": ["m.ply"]}, whole, m__ply=mesh)

@@ -53,6 +53,7 @@ _SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
     "Change a scene": {
         "clean": ("clean", "Remove faint Gaussians, oversized ones and floaters."),
         "crop": ("crop", "Keep part of a scene."),
+        "simplify": ("simplify", "Merge neighbors until so many Gaussians are left."),
         "transform": ("transform", "Move, turn or scale a scene."),
         "merge": ("merge", "Put scenes together."),
         "edit": ("edit", "Turn a mesh edited elsewhere back into Gaussians."),

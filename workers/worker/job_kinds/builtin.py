@@ -24,6 +24,7 @@ from octasplat.engine.operations.reconstruct import OPERATION as RECONSTRUCT
 from octasplat.engine.operations.reconstruct import options_from_json
 from octasplat.engine.operations.relight import OPERATION as RELIGHT
 from octasplat.engine.operations.render import OPERATION as RENDER
+from octasplat.engine.operations.simplify import OPERATION as SIMPLIFY
 from octasplat.engine.operations.stage_init import OPERATION as STAGE_INIT
 from octasplat.engine.operations.transform import OPERATION as TRANSFORM
 from octasplat.engine.runs.config import ReconstructionConfig, revise_requested
@@ -190,6 +191,7 @@ BUILTIN_KINDS: tuple[JobKind[Any], ...] = (
     SurfaceKind(),
     SceneEditKind(CROP),
     SceneEditKind(CLEAN),
+    SceneEditKind(SIMPLIFY),
     SceneEditKind(TRANSFORM, keeps_world_frame=False),
     SceneEditKind(EDIT, sequence_option="meshes"),
     SceneEditKind(DEFORM, sequence_option="deformed"),

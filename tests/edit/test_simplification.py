@@ -1,0 +1,131 @@
+"""Fewer Gaussians that look alike: moments of pairs, and pictures beside those of the largest alone."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from octasplat.engine.core.rays import RayBatch
+from octasplat.engine.edit.simplification import simplify
+from octasplat.engine.gaussians.frames import frames_from_normals, quaternions_from_matrices
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.trace.factory import make_tracer
+from octasplat.engine.trace.protocol import TraceSettings
+
+Make = Callable[..., FlatGaussians]
+
+
+def covariances(gaussians: FlatGaussians) -> np.ndarray:
+    axes = gaussians.rotations[:, :, 1:].astype(np.float64) * gaussians.scales[:, None, :]
+    return axes @ axes.transpose(0, 2, 1)
+
+
+def sphere(count: int, seed: int = 0) -> FlatGaussians:
+    """A painted ball of small opaque Gaussians, evenly spread."""
+    rng = np.random.default_rng(seed)
+    k = np.arange(count) + 0.5
+    z, turn = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k
+    normals = np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], axis=1)
+    rgb = 0.5 + 0.4 * np.sin(3 * normals + [0, 1, 2])
+    return FlatGaussians(
+        means_world=normals.astype(np.float32),
+        quats_wxyz=quaternions_from_matrices(frames_from_normals(normals)).astype(np.float32),
+        log_scales=np.float32(np.log(1.2 / np.sqrt(count)) + 0.1 * rng.standard_normal((count, 2))),
+        opacity_logits=np.float32(2 + 0.3 * rng.standard_normal(count)),
+        sh=((rgb - 0.5) / 0.28209479)[:, None].astype(np.float32),
+    )
+
+
+def picture(gaussians: FlatGaussians) -> np.ndarray:
+    """Colors along a grid of rays towards the ball."""
+    side = np.linspace(-1.2, 1.2, 48, dtype=np.float32)
+    x, y = np.meshgrid(side, side)
+    origins = np.stack([x, y, np.full_like(x, -4)], axis=-1).reshape(-1, 3)
+    tracer = make_tracer(TraceSettings(), threads=1)
+    tracer.build(gaussians)
+    directions = np.broadcast_to(np.float32([0, 0, 1]), origins.shape)
+    return tracer.trace(RayBatch(origins, np.ascontiguousarray(directions), 0.0)).rgb_srgb
+
+
+def test_pair_has_mass_mean_and_covariance_of_its_mixture() -> None:
+    rng = np.random.default_rng(1)
+    frames = frames_from_normals(np.array([[0, 0, 1.0], [0, 0, -1.0]]))
+    pair = FlatGaussians(
+        means_world=np.float32([[0, 0, 0], [0.3, 0.1, 0]]),
+        quats_wxyz=quaternions_from_matrices(frames).astype(np.float32),
+        log_scales=np.float32(np.log([[0.2, 0.1], [0.15, 0.3]])),
+        opacity_logits=np.float32([-1.5, -1.0]),
+        sh=rng.standard_normal((2, 4, 3)).astype(np.float32),
+    )
+    one = simplify(pair, 1)
+    masses = pair.opacities.astype(np.float64) * pair.scales.prod(axis=1)
+    share = masses / masses.sum()
+    mean = share @ pair.means_world
+    apart = pair.means_world - mean
+    expected = np.einsum("n,nij->ij", share, covariances(pair) + apart[:, :, None] * apart[:, None, :])
+    np.testing.assert_allclose(one.means_world[0], mean, atol=1e-6)
+    np.testing.assert_allclose(covariances(one)[0], expected, atol=1e-6)
+    np.testing.assert_allclose(one.opacities[0] * one.scales.prod(), masses.sum(), rtol=1e-5)
+    np.testing.assert_allclose(one.sh[0], np.einsum("n,nkc->kc", share, pair.sh), atol=1e-6)
+    assert abs(one.rotations[0, 2, 0]) == pytest.approx(1)
+
+
+def test_opaque_neighbours_keep_their_mass_as_area() -> None:
+    ball = sphere(400)
+    fewer = simplify(ball, 100)
+    mass = lambda g: float((g.opacities.astype(np.float64) * g.scales.prod(axis=1)).sum())  # noqa: E731
+    assert len(fewer) == 100 and mass(fewer) == pytest.approx(mass(ball), rel=1e-3)
+    assert fewer.opacities.max() <= 0.995 + 1e-6 and fewer.is_finite()
+    outward = (fewer.rotations[:, :, 0] * fewer.means_world).sum(axis=1)
+    assert (outward > 0).all()  # normals stay on their side
+
+
+def test_half_of_a_ball_looks_nearly_like_all_of_it() -> None:
+    ball = sphere(6000)
+    whole, fewer = picture(ball), simplify(ball, 3000)
+    largest = ball.select(np.sort(np.argsort(-ball.opacities * ball.scales.prod(axis=1))[:3000]))
+    errors = [np.sqrt(((picture(scene) - whole) ** 2).mean()) for scene in (fewer, largest)]
+    assert errors[0] < 0.05 and errors[0] < 0.35 * errors[1]
+    again = simplify(ball, 3000)
+    for name in ("means_world", "quats_wxyz", "log_scales", "opacity_logits", "sh"):
+        np.testing.assert_array_equal(getattr(fewer, name), getattr(again, name))
+
+
+def test_unlike_colors_are_merged_last(make_gaussians: Make) -> None:
+    row = sphere(60)
+    red = row.means_world[:, 0] > 0
+    row.sh[:, 0] = np.where(red[:, None], np.float32([1.5, -1.5, -1.5]), np.float32([-1.5, -1.5, 1.5]))
+    fewer = simplify(row, 12)
+    assert len(np.unique(fewer.sh[:, 0].round(3), axis=0)) == 2
+    assert len(simplify(make_gaussians(7), 7)) == len(simplify(make_gaussians(7), 100)) == 7
+    assert len(simplify(make_gaussians(7, sh_degree=2), 1)) == 1
+
+
+def test_channels_of_pairs_are_means_or_those_of_the_larger() -> None:
+    near = sphere(2)
+    near.means_world[:] = [[0, 0, 1], [0.01, 0, 1]]
+    near.log_scales[:] = np.log([[0.2, 0.2], [0.1, 0.1]])
+    near.opacity_logits[:] = 0
+    channels = {
+        "albedo": np.float32([[0.2, 0.2, 0.2], [0.7, 0.7, 0.7]]), "metallic": np.float32([[0], [1]]),
+        "roughness": np.float32([[0.5], [0.5]]), "label": np.float32([[3], [8]]),
+    }  # fmt: skip
+    one = simplify(near.with_channels(channels), 1)
+    assert one.channels["label"][0] == 3
+    np.testing.assert_allclose(one.channels["albedo"][0], 0.3, atol=1e-6)
+    np.testing.assert_allclose(one.channels["metallic"][0], 0.2, atol=1e-6)
+    channels = {name: array * np.float32([[0], [1]]) for name, array in channels.items()}
+    unknown = simplify(near.with_channels(channels), 1)
+    np.testing.assert_allclose(unknown.channels["albedo"][0], 0.7, atol=1e-6)
+
+
+def test_rounds_are_told_and_may_stop() -> None:
+    told: list[int] = []
+    simplify(sphere(200), 50, told.append)
+    assert told[-1] == 50 and told == sorted(told, reverse=True) and len(told) > 3
+
+    def stop(left: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        simplify(sphere(200), 50, stop)
