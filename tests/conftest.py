@@ -1,6 +1,8 @@
 """For all tests: array shapes are checked at run time, and the photographed scenes are found."""
 
+import compileall
 import os
+import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +22,9 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before OpenMP is loaded, 
 ROOT = Path(__file__).resolve().parent.parent
 # The memory of written files is that of the tests, not of whoever runs them.
 os.environ["OCTASPLAT_WRITTEN"] = str(Path(tempfile.mkdtemp(prefix="octasplat-tests-")) / "written.sqlite")
+# Hundreds of processes are started, each of which would compile hundreds of modules anew without this.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 
 def checked_modules() -> list[str]:
@@ -40,7 +45,13 @@ shape_checks.install(checked_modules())
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Files are handed out in the order of the items; xdist would begin with those of the most tests."""
+    """Files are handed out in the order of the items; xdist would begin with those of the most tests.
+
+    Modules are compiled before, as the processes of jobs, which may write nothing, only read them so.
+    """
+    if not hasattr(config, "workerinput"):
+        for package in ("engine", "workers", "service"):
+            compileall.compile_dir(ROOT / package, quiet=1)
     if hasattr(config.option, "loadscopereorder"):
         config.option.loadscopereorder = False
 

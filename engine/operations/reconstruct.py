@@ -69,6 +69,7 @@ class ReconstructOptions(RunSettings, Options):
     )
     assignments: Annotated[tuple[str, ...], Spelling(("--set",), metavar="NAME=VALUE"), ADVANCED] = Field(
         (),
+        max_length=1000,
         description="Any other setting, e.g. lr.quat=0.02 or test_every=4, values as JSON; octasplat "
         "config list shows them.",
     )

@@ -100,31 +100,39 @@ def test_dataset_text_model_is_accepted(local_storage: LocalStorage) -> None:
 
 
 SOUND = ColmapModelBuilder()
+BAD_NAMES: dict[str, tuple[str | bytes, str]] = {
+    "traversal": ("../../../../etc/passwd", "name-traversal"),
+    "absolute": ("/etc/passwd", "name-absolute"),
+    "windows": ("..\\..\\evil.png", "name-backslash"),
+    "line break": ("v0.png\nv1.png", "name-control"),
+    "name not in utf-8": (b"\xff\xfe.png", "name-not-text"),
+    "no name": ("", "name-empty"),
+    "not uploaded": ("v9.png", "model-image-missing"),
+    "twice": ("v1.png", "model-image-twice"),
+}
+BAD_POSES: dict[str, dict[str, tuple[float, ...]]] = {
+    "zero quaternion": {"quat_wxyz": (0, 0, 0, 0)},
+    "long quaternion": {"quat_wxyz": (0, 2, 0, 0)},
+    "no number in quaternion": {"quat_wxyz": (NAN, 0, 0, 0)},
+    "infinite quaternion": {"quat_wxyz": (INF, 0, 0, 0)},
+    "no number in translation": {"translation": (NAN, 0, 0)},
+    "infinite translation": {"translation": (0, -INF, 0)},
+    "absurd translation": {"translation": (0, 1e300, 0)},
+}
+BAD_CAMERAS: dict[str, CameraRecord] = {
+    "no focal length": CameraRecord(params=(0, 31, 16, 12)),
+    "negative focal length": CameraRecord(params=(-3, 31, 16, 12)),
+    "nan focal length": CameraRecord(params=(NAN, 31, 16, 12)),
+    "infinite centre": CameraRecord(params=(30, 31, INF, 12)),
+    "without size": CameraRecord(width=0, height=0),
+}
+CAMERAS_OF_OTHER_SIZE: dict[str, CameraRecord] = {
+    "turned": CameraRecord(width=24, height=32),
+    "2^60": CameraRecord(width=2**60),
+}
 IMAGES, CAMERAS, POINTS = "sparse/0/images.bin", "sparse/0/cameras.bin", "sparse/0/points3D.bin"
 HORRORS: dict[str, tuple[Callable[[], ColmapModelBuilder], str, str | None]] = {
-    "traversal": (lambda: SOUND.with_image(name="../../../../etc/passwd"), "name-traversal", IMAGES),
-    "absolute": (lambda: SOUND.with_image(name="/etc/passwd"), "name-absolute", IMAGES),
-    "windows": (lambda: SOUND.with_image(name="..\\..\\evil.png"), "name-backslash", IMAGES),
-    "line break": (lambda: SOUND.with_image(name="v0.png\nv1.png"), "name-control", IMAGES),
     "name of 50 MB": (lambda: SOUND.with_image(name="a" * 50_000_000), "name-too-long", IMAGES),
-    "name not in utf-8": (lambda: SOUND.with_image(name=b"\xff\xfe.png"), "name-not-text", IMAGES),
-    "no name": (lambda: SOUND.with_image(name=""), "name-empty", IMAGES),
-    "not uploaded": (lambda: SOUND.with_image(name="v9.png"), "model-image-missing", IMAGES),
-    "twice": (lambda: SOUND.with_image(name="v1.png"), "model-image-twice", IMAGES),
-    "zero quaternion": (lambda: SOUND.with_image(quat_wxyz=(0, 0, 0, 0)), "model-pose", IMAGES),
-    "long quaternion": (lambda: SOUND.with_image(quat_wxyz=(0, 2, 0, 0)), "model-pose", IMAGES),
-    "no number in quaternion": (lambda: SOUND.with_image(quat_wxyz=(NAN, 0, 0, 0)), "model-pose", IMAGES),
-    "infinite quaternion": (lambda: SOUND.with_image(quat_wxyz=(INF, 0, 0, 0)), "model-pose", IMAGES),
-    "no number in translation": (lambda: SOUND.with_image(translation=(NAN, 0, 0)), "model-pose", IMAGES),
-    "infinite translation": (lambda: SOUND.with_image(translation=(0, -INF, 0)), "model-pose", IMAGES),
-    "absurd translation": (lambda: SOUND.with_image(translation=(0, 1e300, 0)), "model-pose", IMAGES),
-    "no focal length": (lambda: SOUND.with_camera(params=(0, 31, 16, 12)), "model-camera", CAMERAS),
-    "negative focal length": (lambda: SOUND.with_camera(params=(-3, 31, 16, 12)), "model-camera", CAMERAS),
-    "nan focal length": (lambda: SOUND.with_camera(params=(NAN, 31, 16, 12)), "model-camera", CAMERAS),
-    "infinite centre": (lambda: SOUND.with_camera(params=(30, 31, INF, 12)), "model-camera", CAMERAS),
-    "camera without size": (lambda: SOUND.with_camera(width=0, height=0), "model-camera", CAMERAS),
-    "camera of other size": (lambda: SOUND.with_camera(width=24, height=32), "model-size", CAMERAS),
-    "camera of 2^60": (lambda: SOUND.with_camera(width=2**60), "model-size", CAMERAS),
     "unknown camera model": (lambda: SOUND.with_camera(model=77), "model-damaged", CAMERAS),
     "unknown camera": (lambda: SOUND.with_image(camera_id=9), "model-damaged", None),
     "camera twice": (lambda: replace(SOUND, cameras=(CameraRecord(), CameraRecord())), "model-damaged", None),
@@ -156,6 +164,40 @@ def test_dataset_inconsistent_model_is_refused(local_storage: LocalStorage, case
     assert code in {fault.code for fault in faults}
     assert any(fault.code == code and (file is None or fault.file == file) for fault in faults)
     assert time.perf_counter() - began < 60
+
+
+def test_bad_names_poses_and_cameras_are_all_listed(local_storage: LocalStorage) -> None:
+    bad_cameras = [*BAD_CAMERAS.values(), *CAMERAS_OF_OTHER_SIZE.values()]
+    cameras = [replace(camera, camera_id=2 + number) for number, camera in enumerate(bad_cameras)]
+    named = [ImageRecord(10 + number, name) for number, (name, _) in enumerate(BAD_NAMES.values())]
+    posed = [
+        ImageRecord(30 + number, f"pose{number}.png", **changes)
+        for number, changes in enumerate(BAD_POSES.values())
+    ]
+    taken = [
+        ImageRecord(50 + number, f"camera{number}.png", camera_id=camera.camera_id)
+        for number, camera in enumerate(cameras)
+    ]
+    model = replace(SOUND, images=[*SOUND.images, *named, *posed, *taken], cameras=[CameraRecord(), *cameras])
+    sound = [str(image.name) for image in (*SOUND.images, *posed, *taken)]
+    faults = faults_of(local_storage, {**photographs(sound), **model.files()})
+    found = [(fault.code, fault.file) for fault in faults]
+    in_cameras = len(BAD_CAMERAS), len(CAMERAS_OF_OTHER_SIZE)
+    assert found == [
+        *((code, IMAGES) for _, code in BAD_NAMES.values()),
+        *[("model-pose", IMAGES)] * len(BAD_POSES),
+        *[("model-camera", CAMERAS)] * in_cameras[0],
+        *[("model-size", CAMERAS)] * in_cameras[1],
+    ]
+    details = [fault.detail for fault in faults[len(BAD_NAMES) :]]
+    poses, cameras_, sizes = (
+        details[: len(posed)],
+        details[len(posed) : -in_cameras[1]],
+        details[-in_cameras[1] :],
+    )
+    assert all(image.name in detail for image, detail in zip(posed, poses, strict=True))
+    assert all(f"Camera {2 + number} " in detail for number, detail in enumerate(cameras_))
+    assert all(image.name in detail for image, detail in zip(taken[-2:], sizes, strict=True))
 
 
 def test_dataset_faults_have_json_pointers(local_storage: LocalStorage) -> None:
@@ -303,7 +345,7 @@ def damaged_models(draw: st.DrawFn) -> dict[str, bytes]:
 
 @pytest.mark.heavy
 @settings(
-    deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], database=None, max_examples=40
+    deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], database=None, max_examples=15
 )
 @given(files=damaged_models())
 def test_dataset_damaged_model_is_refused(local_storage: LocalStorage, files: dict[str, bytes]) -> None:

@@ -56,6 +56,9 @@ SHAPES: dict[str, Callable[[], bytes]] = {
     "assignments": lambda: json.dumps(
         {"kind": "reconstruct", "options": {"assignments": ["lr.mean=0.001"] * 49_000}}
     ).encode(),
+    "as many assignments as are allowed": lambda: json.dumps(
+        {"kind": "reconstruct", "options": {"assignments": ["lr.mean=0.001"] * 1000}}
+    ).encode(),
     "photographs": lambda: json.dumps(
         {"kind": "reconstruct", "photographs": [{"width_px": 9, "height_px": 9, "count": 1}] * 12_000}
     ).encode(),

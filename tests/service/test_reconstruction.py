@@ -30,7 +30,7 @@ pytestmark = pytest.mark.heavy
 
 ROOT = Path(__file__).parents[2]
 TRAIN = {
-    "iterations": 500,
+    "iterations": 200,
     "rays_per_batch": 512,
     "sh_degree": 1,
     "max_gaussians": 500,
@@ -71,6 +71,10 @@ class Machine:
             self.process.terminate()
         return self.process.wait(120)
 
+    def start_again(self) -> None:
+        """Start it on the same data folder after :meth:`stop`."""
+        self.process = start(self.data).process
+
 
 def start(data: Path) -> Machine:
     environment = {
@@ -109,9 +113,10 @@ def undisturbed(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return reconstruct(scene, tmp_path_factory.mktemp("undisturbed") / "run", config, threads=1)
 
 
-@pytest.fixture
-def machine(short_root: Path, request: pytest.FixtureRequest) -> Iterator[Machine]:
-    machine = start(short_root / f"m{abs(hash(request.node.name)) % 10**6}")
+@pytest.fixture(scope="module")
+def machine(short_root: Path) -> Iterator[Machine]:
+    """One service for all tests, which leave it running."""
+    machine = start(short_root / "whole")
     yield machine
     machine.stop()
 
@@ -139,7 +144,7 @@ def check_what_is_shown(api: Api, machine: Machine, job: dict[str, Any]) -> None
 
     logs = command("logs", job["id"])
     for line in ("Attempt 1", "Lost, and queued again", "Goes on from step", "Loaded 8 photographs in",
-                 "Trained 500 iterations in", "held out", "Exported", "Succeeded"):  # fmt: skip
+                 "Trained 200 iterations in", "held out", "Exported", "Succeeded"):  # fmt: skip
         assert line in logs, logs
     assert f"PSNR {job['psnr']:.2f} dB over held-out views; {job['training_psnr']:.2f} dB" in command(
         "status", job["id"]
@@ -200,69 +205,52 @@ def test_reconstruction_after_kills_gives_same_bytes(
 
 
 def test_restarted_service_continues_and_derived_jobs_use_result(
-    short_root: Path, scene: Path, undisturbed: Path, tmp_path: Path
+    machine: Machine, scene: Path, undisturbed: Path, tmp_path: Path
 ) -> None:
-    machine = start(short_root / "again")
-    try:
-        with machine.api as api:
-            dataset = upload_scene(api, scene)
-            assert dataset["state"] == "committed" and dataset["photographs"] == 8
-            assert upload_scene(api, scene)["id"] == dataset["id"]  # nothing is sent twice
-            job = submit(api, Submission(Path(dataset["id"]), OPTIONS))
-            while api.get(f"/v1/jobs/{job['id']}")["checkpoint"] is None:
-                time.sleep(0.05)
-        assert machine.stop() == 0
-        machine = start(short_root / "again")
-        with machine.api as api:
-            done = watch_job(api, job["id"], lambda _event: None, lambda _state: None)
-            assert done["state"] == "succeeded" and done["rescues"] == 0
-            download_results(api, job["id"], tmp_path / "result")
-            assert contents(tmp_path / "result") == contents(undisturbed)
-            assert done["preview"]["view"].endswith(".png")
-            picture = api.request("GET", f"/v1/jobs/{job['id']}/preview")
-            assert picture.content.startswith(b"\x89PNG")
-            for kind, options, expected in (
-                ("export", {"files": ["again.glb", "cloud.ply"]}, {"again.glb", "cloud.ply"}),
-                ("evaluate", {}, {"metrics.json", "report.html", "renders/view_000.png"}),
-                ("info", {}, {"info.json", "picture.png"}),
-                ("surface", {"resolution": 32, "depth_side": 32}, {"surface.glb"}),
-                ("render", {"frames": 3, "width_px": 32, "height_px": 32}, {"turntable.mp4"}),
-            ):
-                body = {"kind": kind, "source_id": job["id"], "options": options}
-                other = watch_job(
-                    api, api.post("/v1/jobs", body)["id"], lambda _event: None, lambda _state: None
-                )
-                assert other["state"] == "succeeded", other
-                artifacts = api.get(f"/v1/jobs/{other['id']}/artifacts")["artifacts"]
-                assert {artifact["name"] for artifact in artifacts} == expected
-            (tmp_path / "thing.obj").write_text("v 0 0 0\nv 9 0 0\nv 0 9 0\nf 1 2 3\n")
-            stage = tmp_path / "stage.toml"
-            stage.write_text('[[meshes]]\nfile = "thing.obj"\n[integrator]\nsamples = 1\n')
-            words = (
-                "--stage",
-                stage,
-                "--set",
-                "mode=views",
-                "--set",
-                "format=png",
-                "--label",
-                "lit",
-                "--wait",
-            )
-            command = ("derive", "render", job["id"], *words, "-o", tmp_path / "lit")
-            environment = {"OCTASPLAT_DATA": str(machine.data)}
-            lit = CliRunner(env=environment).invoke(cli, [str(word) for word in command])
-            assert lit.exit_code == 0 and "Rendered 1 image in" in lit.output, lit.output
-            assert (tmp_path / "lit" / "views" / "view_000.png").is_file()
-            with pytest.raises(ServiceError, match="no result nothing"):
-                download_results(api, job["id"], tmp_path, names=("nothing",))
-    finally:
-        assert machine.stop() == 0
+    with machine.api as api:
+        dataset = upload_scene(api, scene)
+        assert dataset["state"] == "committed" and dataset["photographs"] == 8
+        assert upload_scene(api, scene)["id"] == dataset["id"]  # nothing is sent twice
+        job = submit(api, Submission(Path(dataset["id"]), OPTIONS))
+        while api.get(f"/v1/jobs/{job['id']}")["checkpoint"] is None:
+            time.sleep(0.05)
+    assert machine.stop() == 0
+    machine.start_again()
+    with machine.api as api:
+        done = watch_job(api, job["id"], lambda _event: None, lambda _state: None)
+        assert done["state"] == "succeeded" and done["rescues"] == 0
+        download_results(api, job["id"], tmp_path / "result")
+        assert contents(tmp_path / "result") == contents(undisturbed)
+        assert done["preview"]["view"].endswith(".png")
+        picture = api.request("GET", f"/v1/jobs/{job['id']}/preview")
+        assert picture.content.startswith(b"\x89PNG")
+        # What a job of each kind makes of a result is tested in test_every_kind.py.
+        (tmp_path / "thing.obj").write_text("v 0 0 0\nv 9 0 0\nv 0 9 0\nf 1 2 3\n")
+        stage = tmp_path / "stage.toml"
+        stage.write_text('[[meshes]]\nfile = "thing.obj"\n[integrator]\nsamples = 1\n')
+        words = (
+            "--stage",
+            stage,
+            "--set",
+            "mode=views",
+            "--set",
+            "format=png",
+            "--label",
+            "lit",
+            "--wait",
+        )
+        command = ("derive", "render", job["id"], *words, "-o", tmp_path / "lit")
+        environment = {"OCTASPLAT_DATA": str(machine.data)}
+        lit = CliRunner(env=environment).invoke(cli, [str(word) for word in command])
+        assert lit.exit_code == 0 and "Rendered 1 image in" in lit.output, lit.output
+        assert (tmp_path / "lit" / "views" / "view_000.png").is_file()
+        with pytest.raises(ServiceError, match="no result nothing"):
+            download_results(api, job["id"], tmp_path, names=("nothing",))
 
 
 def test_killed_database_is_restarted(machine: Machine, scene: Path) -> None:
     with machine.api as api:
-        job = submit(api, Submission(scene, OPTIONS))
+        job = submit(api, Submission(scene, {**OPTIONS, "exports": []}))
         while api.get(f"/v1/jobs/{job['id']}")["checkpoint"] is None:
             time.sleep(0.05)
         pid = int((machine.data / "postgres/cluster/postmaster.pid").read_text().split()[0])

@@ -120,12 +120,7 @@ class WorkerHarness:
     def job(self, job_id: uuid.UUID) -> Job:
         """The job as it is."""
         with psycopg.connect(self.conninfo) as connection:
-            cursor = connection.cursor(row_factory=class_row(Job))
-            job = cursor.execute(
-                select_columns("SELECT {} FROM jobs WHERE id = %s", Job), [job_id]
-            ).fetchone()
-        assert job is not None
-        return job
+            return _read_job(connection, job_id)
 
     def events(self, job_id: uuid.UUID) -> list[JobEvent]:
         """What happened to the job."""
@@ -150,9 +145,11 @@ class WorkerHarness:
     def wait(self, job_id: uuid.UUID, ready: Callable[[Job], bool], seconds: float = MAX_WAIT_SECONDS) -> Job:
         """Wait until the job is as asked for."""
         deadline = time.monotonic() + seconds
-        while not ready(job := self.job(job_id)):
-            assert time.monotonic() < deadline, f"{job}\n{self.worker_logs()}"
-            time.sleep(0.03)
+        # One connection for all looks: each new one costs the server a process.
+        with psycopg.connect(self.conninfo, autocommit=True) as connection:
+            while not ready(job := _read_job(connection, job_id)):
+                assert time.monotonic() < deadline, f"{job}\n{self.worker_logs()}"
+                time.sleep(0.05)
         return job
 
     def wait_until_finished(self, job_id: uuid.UUID, seconds: float = MAX_WAIT_SECONDS) -> Job:
@@ -199,6 +196,13 @@ class WorkerHarness:
     def worker_logs(self) -> str:
         """What the workers said."""
         return "\n".join(path.read_text(errors="replace")[-3000:] for path in self.folder.glob("*.log"))
+
+
+def _read_job(connection: "psycopg.Connection[Any]", job_id: uuid.UUID) -> Job:
+    cursor = connection.cursor(row_factory=class_row(Job))
+    job = cursor.execute(select_columns("SELECT {} FROM jobs WHERE id = %s", Job), [job_id]).fetchone()
+    assert job is not None
+    return job
 
 
 def child_pids(worker: "subprocess.Popen[bytes]") -> list[int]:

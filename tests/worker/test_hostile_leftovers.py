@@ -48,22 +48,20 @@ def wait_for(condition: Callable[[], object], seconds: float = 60.0) -> None:
 
 
 @pytest.mark.parametrize("how", ["quiet", "loud", "fleeing"])
-def test_daemons_of_a_job_end_with_it(bench: WorkerHarness, how: str) -> None:
-    start_worker(bench)
-    job_id = bench.submit("hostile", options={"attack": "daemon", "target": how})
-    job = bench.wait_until_finished(job_id, 60)
+def test_daemons_of_a_job_end_with_it(shared_bench: WorkerHarness, how: str) -> None:
+    job_id = shared_bench.submit("hostile", options={"attack": "daemon", "target": how})
+    job = shared_bench.wait_until_finished(job_id)
     assert job.state == "succeeded" and daemons(job_id) == []
 
 
-def test_canceled_job_with_a_held_pipe_frees_its_slot(bench: WorkerHarness) -> None:
-    start_worker(bench)
-    job_id = bench.submit("hostile", options={"attack": "daemon", "target": "loud", "lasts": True})
+def test_canceled_job_with_a_held_pipe_frees_its_slot(shared_bench: WorkerHarness) -> None:
+    job_id = shared_bench.submit("hostile", options={"attack": "daemon", "target": "loud", "lasts": True})
     wait_for(lambda: daemons(job_id))
-    bench.cancel(job_id)
-    job = bench.wait_until_finished(job_id, 60)
+    shared_bench.cancel(job_id)
+    job = shared_bench.wait_until_finished(job_id)
     assert job.state in ("canceled", "succeeded") and daemons(job_id) == []
-    later = bench.submit("hostile", options={"attack": "daemon"})
-    assert bench.wait_until_finished(later, 60).state == "succeeded"
+    later = shared_bench.submit("hostile", options={"attack": "daemon"})
+    assert shared_bench.wait_until_finished(later).state == "succeeded"
 
 
 def test_daemons_end_when_their_worker_is_killed(bench: WorkerHarness) -> None:
@@ -95,15 +93,14 @@ def test_shared_memory_counts() -> None:
 
 
 @pytest.mark.parametrize("lasts", [False, True])
-def test_folders_too_deep_end_the_job_and_not_its_worker(bench: WorkerHarness, lasts: bool) -> None:
-    start_worker(bench)
-    job_id = bench.submit("hostile", options={"attack": "dig", "lasts": lasts})
-    job = bench.wait_until_finished(job_id, 60)
+def test_folders_too_deep_end_the_job_and_not_its_worker(shared_bench: WorkerHarness, lasts: bool) -> None:
+    job_id = shared_bench.submit("hostile", options={"attack": "dig", "lasts": lasts})
+    job = shared_bench.wait_until_finished(job_id)
     if lasts:
         assert job.state == "failed" and job.error is not None and job.error["type"] == "not_a_file"
-    later = bench.submit("hostile", options={"attack": "daemon"})
-    assert bench.wait_until_finished(later, 60).state == "succeeded"
-    wait_for(lambda: not list(bench.folder.glob("work-*/attempts/*")))
+    later = shared_bench.submit("hostile", options={"attack": "daemon"})
+    assert shared_bench.wait_until_finished(later).state == "succeeded"
+    wait_for(lambda: not list(shared_bench.folder.glob("work-*/attempts/*")))
 
 
 CHAIN = """

@@ -14,9 +14,8 @@ SECRET = b"the token of the administrator"
 
 
 @pytest.fixture
-def bench(bench: WorkerHarness) -> WorkerHarness:
-    bench.worker(KIND_MODULES='["tests.support.hostile_kind"]')
-    return bench
+def bench(shared_bench: WorkerHarness) -> WorkerHarness:
+    return shared_bench
 
 
 @pytest.fixture
@@ -50,7 +49,7 @@ def test_preview_is_not_taken_through_a_link(bench: WorkerHarness, shut: Path) -
 def test_results_are_regular_files_of_the_job_alone(bench: WorkerHarness, shut: Path, attack: str) -> None:
     target = shut if attack == "link results" else shut / "token"
     job_id = bench.submit("hostile", options={"attack": attack, "target": str(target)})
-    job = bench.wait_until_finished(job_id, 60)
+    job = bench.wait_until_finished(job_id)
     assert (job.state, job.attempt) == ("failed", 1)
     assert job.error is not None and job.error["type"] == "not_a_file"
     assert bench.results(job_id) == {} and not is_stored(bench, SECRET)

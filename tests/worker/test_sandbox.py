@@ -68,10 +68,11 @@ def test_sandboxed_job_sees_no_secrets_and_yields_the_cpu(bench: WorkerHarness) 
     assert not list(bench.folder.rglob("planted"))
 
 
-def test_job_exceeding_process_limit_fails(bench: WorkerHarness) -> None:
-    bench.worker(KIND_MODULES='["tests.support.spy_kind"]')
-    job_id = bench.submit("spy", options={"secrets": [str(bench.folder / "x")], "children": 300})
-    job = bench.wait_until_finished(job_id)
+def test_job_exceeding_process_limit_fails(shared_bench: WorkerHarness) -> None:
+    job_id = shared_bench.submit(
+        "spy", options={"secrets": [str(shared_bench.folder / "x")], "children": 300}
+    )
+    job = shared_bench.wait_until_finished(job_id)
     assert job.state == "failed" and job.error is not None and job.error["type"] == "process_limit"
 
 

@@ -31,16 +31,15 @@ def starts(bench: WorkerHarness, job_id: uuid.UUID) -> list[int]:
     return [int(line) for line in bench.results(job_id)["history.txt"].split()]
 
 
-def test_job_succeeds_and_events_are_recorded(bench: WorkerHarness) -> None:
-    bench.worker()
-    job_id = bench.submit(options={"steps": 12, "seconds": 0.01})
-    job = bench.wait_until_finished(job_id)
+def test_job_succeeds_and_events_are_recorded(shared_bench: WorkerHarness) -> None:
+    job_id = shared_bench.submit(options={"steps": 12, "seconds": 0.01})
+    job = shared_bench.wait_until_finished(job_id)
     assert (job.state, job.attempt, job.rescues, job.step, job.error) == ("succeeded", 1, 0, 12, None)
-    assert bench.results(job_id) == {"sum.txt": b"78", "history.txt": b"0\n"}
-    states = [event.data["state"] for event in bench.events(job_id) if event.kind == "state"]
+    assert shared_bench.results(job_id) == {"sum.txt": b"78", "history.txt": b"0\n"}
+    states = [event.data["state"] for event in shared_bench.events(job_id) if event.kind == "state"]
     assert states == ["queued", "running", "succeeded"]
-    assert "the toy begins at 0" in bench.log(job_id)
-    assert not any((bench.folder / "work-w" / "attempts").iterdir())
+    assert "the toy begins at 0" in shared_bench.log(job_id)
+    assert not any((shared_bench.folder / "work-w" / "attempts").iterdir())
 
 
 def test_killed_worker_ends_child_and_job_is_recovered(bench: WorkerHarness) -> None:
@@ -60,16 +59,16 @@ def test_killed_worker_ends_child_and_job_is_recovered(bench: WorkerHarness) -> 
     assert bench.results(job_id)["sum.txt"] == str(sum(range(61))).encode()
 
 
-def test_killed_child_is_started_again_from_the_checkpoint(bench: WorkerHarness) -> None:
-    worker = bench.worker()
-    job_id = bench.submit(options=bench.wait_until_held())
-    bench.wait_at_gate(job_id)
+def test_killed_child_is_started_again_from_the_checkpoint(shared_bench: WorkerHarness) -> None:
+    (worker,) = shared_bench.processes
+    job_id = shared_bench.submit(options=shared_bench.wait_until_held())
+    shared_bench.wait_at_gate(job_id)
     os.kill(child_pids(worker)[0], signal.SIGKILL)
-    bench.open_gate()
-    job = bench.wait_until_finished(job_id)
+    shared_bench.open_gate()
+    job = shared_bench.wait_until_finished(job_id)
     assert (job.state, job.attempt) == ("succeeded", 2)
-    assert starts(bench, job_id) == [0, 30]
-    rescued = [event.data for event in bench.events(job_id) if event.kind == "rescued"]
+    assert starts(shared_bench, job_id) == [0, 30]
+    rescued = [event.data for event in shared_bench.events(job_id) if event.kind == "rescued"]
     assert len(rescued) == 1 and "signal 9" in rescued[0]["reason"]
 
 
@@ -94,10 +93,9 @@ def test_frozen_worker_is_fenced_on_return(bench: WorkerHarness) -> None:
     assert first.poll() is None  # the worker itself is fit for other jobs
 
 
-def test_crashing_job_fails_with_reason(bench: WorkerHarness) -> None:
-    bench.worker()
-    job_id = bench.submit(options={"steps": 10, "seconds": 0.01, "crash_at": 7})
-    job = bench.wait_until_finished(job_id)
+def test_crashing_job_fails_with_reason(shared_bench: WorkerHarness) -> None:
+    job_id = shared_bench.submit(options={"steps": 10, "seconds": 0.01, "crash_at": 7})
+    job = shared_bench.wait_until_finished(job_id)
     assert (job.state, job.attempt, job.rescues) == ("failed", 4, 3)
     assert job.error is not None and job.error["type"] == "crashed"
     assert "signal 11" in job.error["message"] and "4 times" in job.error["message"]
@@ -134,31 +132,30 @@ def test_terminated_worker_hands_back_at_once(bench: WorkerHarness) -> None:
     assert [event.kind for event in bench.events(job_id)].count("handed_back") == 1
 
 
-def test_cancelled_job_resumes_when_retried(bench: WorkerHarness) -> None:
-    worker = bench.worker()
-    job_id = bench.submit(options=bench.wait_until_held())
-    bench.wait_at_gate(job_id)
-    assert bench.cancel(job_id).state == "canceling"
-    assert bench.cancel(job_id).state in ("canceling", "canceled")
-    job = bench.wait_until_finished(job_id)
+def test_cancelled_job_resumes_when_retried(shared_bench: WorkerHarness) -> None:
+    (worker,) = shared_bench.processes
+    job_id = shared_bench.submit(options=shared_bench.wait_until_held())
+    shared_bench.wait_at_gate(job_id)
+    assert shared_bench.cancel(job_id).state == "canceling"
+    assert shared_bench.cancel(job_id).state in ("canceling", "canceled")
+    job = shared_bench.wait_until_finished(job_id)
     assert (job.state, job.error) == ("canceled", None) and child_pids(worker) == []
-    assert bench.cancel(job_id).state == "canceled"
-    bench.open_gate()
-    assert bench.retry(job_id).state == "queued"
-    assert bench.wait_until_finished(job_id).state == "succeeded"
-    assert starts(bench, job_id) == [0, 35]
+    assert shared_bench.cancel(job_id).state == "canceled"
+    shared_bench.open_gate()
+    assert shared_bench.retry(job_id).state == "queued"
+    assert shared_bench.wait_until_finished(job_id).state == "succeeded"
+    assert starts(shared_bench, job_id) == [0, 35]
 
 
-def test_retry_from_the_start_forgets_the_checkpoint(bench: WorkerHarness) -> None:
-    bench.worker()
-    job_id = bench.submit(options=bench.wait_until_held())
-    bench.wait_at_gate(job_id)
-    bench.cancel(job_id)
-    bench.wait_until_finished(job_id)
-    bench.open_gate()
-    bench.retry(job_id, fresh=True)
-    assert bench.wait_until_finished(job_id).state == "succeeded"
-    assert starts(bench, job_id) == [0]
+def test_retry_from_the_start_forgets_the_checkpoint(shared_bench: WorkerHarness) -> None:
+    job_id = shared_bench.submit(options=shared_bench.wait_until_held())
+    shared_bench.wait_at_gate(job_id)
+    shared_bench.cancel(job_id)
+    shared_bench.wait_until_finished(job_id)
+    shared_bench.open_gate()
+    shared_bench.retry(job_id, fresh=True)
+    assert shared_bench.wait_until_finished(job_id).state == "succeeded"
+    assert starts(shared_bench, job_id) == [0]
 
 
 def test_unresponsive_program_is_killed_after_grace(bench: WorkerHarness) -> None:
@@ -204,28 +201,28 @@ def test_program_exceeding_memory_limit_is_stopped(bench: WorkerHarness) -> None
     ],
 )
 def test_deterministic_failure_is_not_retried(
-    bench: WorkerHarness, options: dict[str, bool], type_: str, message: str
+    shared_bench: WorkerHarness, options: dict[str, bool], type_: str, message: str
 ) -> None:
-    bench.worker()
-    job_id = bench.submit(options=options)
-    job = bench.wait_until_finished(job_id)
+    job_id = shared_bench.submit(options=options)
+    job = shared_bench.wait_until_finished(job_id)
     assert (job.state, job.attempt, job.error) == ("failed", 1, {"type": type_, "message": message})
-    assert ("Traceback" in bench.log(job_id)) == (type_ == "unexpected")
+    assert ("Traceback" in shared_bench.log(job_id)) == (type_ == "unexpected")
 
 
-def test_results_published_before_a_crash_are_adopted(bench: WorkerHarness) -> None:
+def test_results_published_before_a_crash_are_adopted(shared_bench: WorkerHarness) -> None:
     """A worker that died between publishing and saying so; the work is not done again."""
-    bench.worker()
-    job_id = bench.submit(options={"steps": 5, "seconds": 0.01})
-    bench.wait_until_finished(job_id)
-    with psycopg.connect(bench.conninfo) as connection:
-        connection.execute("DELETE FROM artifacts")
+    job_id = shared_bench.submit(options={"steps": 5, "seconds": 0.01})
+    shared_bench.wait_until_finished(job_id)
+    with psycopg.connect(shared_bench.conninfo) as connection:
+        connection.execute("DELETE FROM artifacts WHERE job_id = %s", [job_id])
         connection.execute(
-            "UPDATE jobs SET state = 'running', heartbeat_at = now() - interval '1 hour', finished_at = NULL"
+            "UPDATE jobs SET state = 'running', heartbeat_at = now() - interval '1 hour', finished_at = NULL "
+            "WHERE id = %s",
+            [job_id],
         )
-    job = bench.wait(job_id, lambda job: job.is_over)
+    job = shared_bench.wait(job_id, lambda job: job.is_over)
     assert (job.state, job.attempt) == ("succeeded", 2)
-    assert bench.results(job_id) == {"sum.txt": b"15", "history.txt": b"0\n"}
+    assert shared_bench.results(job_id) == {"sum.txt": b"15", "history.txt": b"0\n"}
 
 
 def test_jobs_run_by_priority_and_queue(bench: WorkerHarness) -> None:
@@ -240,12 +237,11 @@ def test_jobs_run_by_priority_and_queue(bench: WorkerHarness) -> None:
     assert bench.wait_until_finished(elsewhere).worker == "large"
 
 
-def test_job_log_has_stages_and_causes_without_paths(bench: WorkerHarness) -> None:
-    bench.worker()
-    job_id = bench.submit(options={"tell_paths": True})
-    job = bench.wait_until_finished(job_id)
+def test_job_log_has_stages_and_causes_without_paths(shared_bench: WorkerHarness) -> None:
+    job_id = shared_bench.submit(options={"tell_paths": True})
+    job = shared_bench.wait_until_finished(job_id)
     assert job.error == {"type": "dataset_error", "message": "cache/pixels.bin cannot be read."}
-    lines = bench.log(job_id).splitlines()
+    lines = shared_bench.log(job_id).splitlines()
     print_ = "[x.cc:12] Cannot open:cache/pixels.bin, cache/pixels.bin; see https://example.org/home/x"
     lines.remove(print_)  # comes by another way, so perhaps a moment later
     assert lines == [
@@ -256,23 +252,23 @@ def test_job_log_has_stages_and_causes_without_paths(bench: WorkerHarness) -> No
         "Caused by FileNotFoundError: [Errno 2] No such file or directory: 'cache/pixels.bin'",
         "Failed: cache/pixels.bin cannot be read.",
     ]
-    told = repr([event.data for event in bench.events(job_id)])
-    assert "images/a b.jpg is dark" in told and str(bench.folder) not in told
+    told = repr([event.data for event in shared_bench.events(job_id)])
+    assert "images/a b.jpg is dark" in told and str(shared_bench.folder) not in told
 
-    fault = bench.submit(options={"fault": True})
-    bench.wait_until_finished(fault)
-    log = bench.log(fault)
+    fault = shared_bench.submit(options={"fault": True})
+    shared_bench.wait_until_finished(fault)
+    log = shared_bench.log(fault)
     assert 'File "…/support/toy_kind.py"' in log and "RuntimeError: a fault of the program" in log
-    assert str(ROOT) not in log and str(bench.folder) not in log and sys.prefix not in log
+    assert str(ROOT) not in log and str(shared_bench.folder) not in log and sys.prefix not in log
 
 
-def test_flood_of_log_lines_is_cut(bench: WorkerHarness) -> None:
-    worker = bench.worker()
-    bench.wait_until_up("w")
+def test_flood_of_log_lines_is_cut(shared_bench: WorkerHarness) -> None:
+    (worker,) = shared_bench.processes
+    shared_bench.wait_until_up("w")
     before = psutil.Process(worker.pid).memory_info().rss
-    job_id = bench.submit(options={"steps": 2, "log_lines": 500_000})
-    assert bench.wait_until_finished(job_id).state == "succeeded"
-    lines = bench.log(job_id).splitlines()
+    job_id = shared_bench.submit(options={"steps": 2, "log_lines": 500_000})
+    assert shared_bench.wait_until_finished(job_id).state == "succeeded"
+    lines = shared_bench.log(job_id).splitlines()
     assert len(lines) <= 20_001 and any("the rest is left out" in line for line in lines)
     assert [line for line in lines if "library" not in line and "(More" not in line] == [
         "Attempt 1", "the toy begins at 0", "Training", "Trained 2 iterations in 1.0 s", "Succeeded"
@@ -280,12 +276,12 @@ def test_flood_of_log_lines_is_cut(bench: WorkerHarness) -> None:
     assert psutil.Process(worker.pid).memory_info().rss - before < 40 << 20
 
 
-def test_child_environment_has_no_secrets(bench: WorkerHarness) -> None:
-    worker = bench.worker()
-    job_id = bench.submit(options={"steps": 100_000})
-    bench.wait(job_id, lambda job: job.step is not None)
+def test_child_environment_has_no_secrets(shared_bench: WorkerHarness) -> None:
+    (worker,) = shared_bench.processes
+    job_id = shared_bench.submit(options={"steps": 100_000})
+    shared_bench.wait(job_id, lambda job: job.step is not None)
     environment = Path(f"/proc/{child_pids(worker)[0]}/environ").read_bytes()
     assert b"DATABASE_URL" not in environment and b"SECRET" not in environment
     assert b"PATH=" in environment
-    bench.cancel(job_id)
-    bench.wait_until_finished(job_id)
+    shared_bench.cancel(job_id)
+    shared_bench.wait_until_finished(job_id)
