@@ -13,7 +13,9 @@ import httpx
 import pytest
 from platformdirs import user_cache_dir
 
+from octasplat.workers.postgres.embedded import EmbeddedPostgres
 from tests.support.npm_packages import npm_folder
+from tests.support.postgres_fixtures import copied_database
 from tests.support.service_harness import TOKEN, api_environment
 from tests.support.tiny_dataset import make_tiny_dataset
 
@@ -25,11 +27,13 @@ SECONDS = 300
 
 
 def program(language: str) -> str:
-    """The program in that language of the document."""
+    """The program in that language of the document, with a shorter training."""
     text = (ROOT / "docs" / "service.md").read_text(encoding="utf-8").partition("## Generated clients")[2]
     found = re.search(rf"```{language}\n(.*?)```", text, re.DOTALL)
     assert found is not None
-    return found[1]
+    shorter, count = re.subn(r"(iterations\"?: )200\b", r"\g<1>40", found[1])
+    assert count == 1
+    return shorter
 
 
 def run(*command: str | Path, folder: Path, **environment: str) -> "subprocess.CompletedProcess[str]":
@@ -41,10 +45,21 @@ def run(*command: str | Path, folder: Path, **environment: str) -> "subprocess.C
     return done
 
 
-@pytest.fixture
-def server(conninfo: str, tmp_path: Path) -> Iterator[str]:
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_tiny_dataset(tmp_path_factory)
+
+
+@pytest.fixture(scope="module")
+def server(
+    postgres: EmbeddedPostgres, template: str, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[str]:
     """The address of a front end that has a worker."""
-    data = tmp_path / "data"
+    with copied_database(postgres, template) as conninfo:
+        yield from serve(conninfo, tmp_path_factory.mktemp("server"))
+
+
+def serve(conninfo: str, data: Path) -> Iterator[str]:
     given = {
         **api_environment(conninfo, data), "OCTASPLAT_STORAGE": str(data / "store"),
         "OCTASPLAT_WORK": str(data / "work"), "OCTASPLAT_THREADS": "1", "OMP_NUM_THREADS": "1",
@@ -90,7 +105,7 @@ def python_environment() -> Path:
 
 
 def test_generated_python_client_submits_waits_and_downloads(
-    server: str, document: Path, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+    server: str, document: Path, scene: Path, tmp_path: Path
 ) -> None:
     programs = python_environment()
     path = f"{programs}{os.pathsep}{os.environ['PATH']}"
@@ -99,7 +114,6 @@ def test_generated_python_client_submits_waits_and_downloads(
         folder=tmp_path, PATH=path,
     )  # fmt: skip
     assert "Endpoint will not be generated" not in told.stdout + told.stderr
-    scene = make_tiny_dataset(tmp_path_factory)
     (tmp_path / "submit.py").write_text(program("python"))
     done = run(
         programs / "python", "submit.py", server, TOKEN, scene, "result",
@@ -109,7 +123,7 @@ def test_generated_python_client_submits_waits_and_downloads(
 
 
 def test_generated_typescript_client_submits_waits_and_downloads(
-    server: str, document: Path, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+    server: str, document: Path, scene: Path, tmp_path: Path
 ) -> None:
     beside = ("openapi-typescript@7.13.0", "typescript@5.9.3", "@types/node@20")
     packages = npm_folder("openapi-fetch", "0.17.0", *beside) / "node_modules"
@@ -126,6 +140,5 @@ def test_generated_typescript_client_submits_waits_and_downloads(
         "--types", "node", "submit.mts",
         folder=tmp_path,
     )  # fmt: skip
-    scene = make_tiny_dataset(tmp_path_factory)
     done = run("node", "submit.mjs", server, TOKEN, str(scene), "result", folder=tmp_path)
     check_result(tmp_path / "result", done.stdout)
