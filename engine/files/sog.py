@@ -268,7 +268,8 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     return (path,)
 
 
-def _find_losses(scene: FlatGaussians) -> tuple[str, ...]:
+def find_sog_losses(scene: FlatGaussians) -> tuple[str, ...]:
+    """Return what positions of 16 bits lose of a scene, in sentences."""
     if len(scene) == 0 or not scene.is_finite():
         return ()  # which is refused
     means = scene.means_world.astype(np.float64)
@@ -299,6 +300,6 @@ register(
         write,
         missing_converter,
         holds_harmonics=True,
-        find_losses=_find_losses,
+        find_losses=find_sog_losses,
     )
 )

@@ -1,8 +1,10 @@
 """The converter ``@playcanvas/splat-transform``, run as a program of its own where somebody installed it."""
 
+import math
 import os
 import shutil
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 
 from octasplat.engine.core.errors import SceneFileError
@@ -44,11 +46,31 @@ def convert(source: Path, target: Path, *options: str) -> None:
     Raises:
         SceneFileError: the program is missing, fails, or writes nothing.
     """
+    _run(target, [*options, str(source.resolve())])
+
+
+def convert_levels(levels: Sequence[Path], target: Path, *, chunk_extent_world: float) -> None:
+    """Pack levels of detail into a streamed SOG.
+
+    Args:
+        levels: files to read, the finest first.
+        target: its ``lod-meta.json``; chunks are written beside it.
+        chunk_extent_world: about the largest side of a chunk, world units.
+
+    Raises:
+        SceneFileError: the program is missing, fails, or writes nothing.
+    """
+    tagged = [word for k, level in enumerate(levels) for word in (str(level.resolve()), "-l", str(k))]
+    _run(target, ["-X", str(max(1, math.ceil(chunk_extent_world))), *tagged])  # which takes no fractions
+
+
+def _run(target: Path, arguments: Sequence[str]) -> None:
+    """Run the program on what is to be read and the target."""
     program = find_converter()
     if program is None:
         raise SceneFileError(f"{target}: {missing_converter()}.")
     # Quiet, overwriting, without a GPU
-    command = [str(program), "-q", "-w", "-g", "cpu", *options, str(source.resolve()), str(target.resolve())]
+    command = [str(program), "-q", "-w", "-g", "cpu", *arguments, str(target.resolve())]
     try:
         done = subprocess.run(  # noqa: S603 - no shell, and the paths are absolute
             command, capture_output=True, text=True, timeout=TIMEOUT_SECONDS, check=False

@@ -58,7 +58,7 @@ def run(
     Raises:
         SceneFileError: the scene cannot be read or written.
     """
-    from octasplat.engine.edit.simplification import simplify
+    from octasplat.engine.gaussians.simplification import simplify
     from octasplat.engine.operations import scene_io
 
     source: Path = request.source

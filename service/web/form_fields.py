@@ -19,6 +19,7 @@ DEFAULT_FILE_NAMES = {
     **{file.format: file.name for file in RESULT_FILES},
     "spz": "scene.spz",
     "sog": "scene.sog",
+    "streamed-sog": "lod-meta.json",
     "splat": "scene.splat",
     "khr-glb": "scene.splats.glb",
     "usd": "scene.usdz",

@@ -1,5 +1,6 @@
 """PlayCanvas splat-transform as judge: what it writes we read as it does, what we write it reads as we do."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -9,12 +10,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.files import ExportOptions, export_scene, importer_for, read_scene
+from octasplat.engine.core.color import to_bytes
+from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.files import ExportOptions, export_scene, importer_for, read_scene, streamed_sog
 from octasplat.engine.files.gaussian_ply import read_ply_cloud
 from octasplat.engine.gaussians.flattening import GaussianCloud
 from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.render.pinhole_camera import PinholeCamera, focal_from_fov
+from tests.support.browser import open_page, psnr
 from tests.support.cloud_difference import difference
 from tests.support.npm_packages import npm_folder
+from tests.support.shell_scene import our_view, shell_scene
 
 pytestmark = pytest.mark.tools
 Convert = Callable[..., Path]
@@ -137,3 +143,87 @@ def test_sog_is_written_through_it(
     np.testing.assert_allclose(back.base_rgb_srgb, scene.base_rgb_srgb[ours], atol=0.01)
     normals = np.abs(np.sum(back.rotations[:, :, 0] * scene.rotations[ours][:, :, 0], axis=1))
     assert np.degrees(np.arccos(np.clip(normals, -1, 1))).max() < 1.8  # components rounded down too
+
+
+def test_levels_of_detail_are_written_through_it(
+    program: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("OCTASPLAT_SPLAT_TRANSFORM", os.fspath(program))
+    monkeypatch.setattr(streamed_sog, "MIN_LEVEL_COUNT", 50)
+    scene = shell_scene()
+    index, *chunks = export_scene(scene, tmp_path / "out" / "lod-meta.json")
+    meta = json.loads(index.read_text())
+    counts = [len(scene) >> k for k in range(meta["lodLevels"])]
+    assert meta["counts"] == counts == [300, 150, 75]
+    assert {path.relative_to(index.parent).as_posix() for path in chunks} >= set(meta["filenames"])
+    assert sorted(path.name for path in index.parent.iterdir() if path.is_dir()) == sorted(
+        {name.split("/")[0] for name in meta["filenames"]}
+    )
+    levels: dict[str, list[GaussianCloud]] = {}
+    for name in meta["filenames"]:
+        levels.setdefault(name.split("_")[0], []).append(read(index.parent / name))
+    found = [sum(len(cloud.means_world) for cloud in levels[str(k)]) for k in range(len(counts))]
+    assert found == counts
+    means = np.concatenate([cloud.means_world for cloud in levels["0"]])
+    nearest = np.linalg.norm(means[:, None] - scene.means_world[None], axis=2)
+    assert nearest.min(axis=0).max() < 1e-3 and len(np.unique(nearest.argmin(axis=0))) == len(scene)
+    low, high = (np.array(meta["tree"]["bound"][side]) for side in ("min", "max"))
+    assert (low <= scene.means_world.min(axis=0)).all() and (high >= scene.means_world.max(axis=0)).all()
+    again = export_scene(scene.select(slice(0, 90)), index)  # fewer levels: nothing of before is left
+    assert json.loads(index.read_text())["counts"] == [90] and set(again) < {index, *chunks}
+    assert sorted(path.name for path in index.parent.iterdir()) == ["0_0", "lod-meta.json"]
+    shutil.move(index, tmp_path / "out" / "other.json")
+    with pytest.raises(SceneFileError, match="0_0 is there already and no part of it"):
+        export_scene(scene, index)
+    assert (tmp_path / "out" / "0_0" / "meta.json").exists() and not index.exists()
+
+
+PLAYCANVAS_PAGE = """<!doctype html>
+<html><head><style>body { margin: 0; background: #000 } canvas { display: block }</style>
+<script type="importmap">{"imports": {"playcanvas": "/node_modules/playcanvas/build/playcanvas.mjs"}}</script>
+</head><body><canvas id="canvas" width="256" height="256"></canvas><script type="module">
+import * as pc from "playcanvas";
+window.result = (async () => {
+  const graphicsDeviceOptions = { antialias: false, preserveDrawingBuffer: true };
+  const app = new pc.Application(document.getElementById("canvas"), { graphicsDeviceOptions });
+  app.start();
+  app.setCanvasResolution(pc.RESOLUTION_FIXED, 256, 256);
+  const camera = new pc.Entity();
+  const clearColor = new pc.Color(0, 0, 0);
+  camera.addComponent("camera", { clearColor, fov: FOV, nearClip: 0.01, farClip: 100 });
+  camera.setPosition(...POSITION);
+  camera.setEulerAngles(0, 180, 180); // looks along +z with y down
+  app.root.addChild(camera);
+  const asset = new pc.Asset("scene", "gsplat", { url: "/files/lod-meta.json", filename: "lod-meta.json" });
+  app.assets.add(asset);
+  await new Promise((done, fail) => { asset.ready(done); asset.on("error", fail); app.assets.load(asset); });
+  const scene = new pc.Entity();
+  scene.addComponent("gsplat", { asset, unified: true });
+  app.root.addChild(scene);
+  const frames = [];
+  for (let k = 0; k < 40; k++) {
+    await new Promise((done) => setTimeout(done, 100));
+    app.renderNextFrame = true;
+    frames.push(app.stats.frame.gsplats ?? 0);
+  }
+  return frames;
+})();
+</script></body></html>
+"""
+
+
+def test_playcanvas_shows_levels_of_detail(
+    program: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("OCTASPLAT_SPLAT_TRANSFORM", os.fspath(program))
+    monkeypatch.setattr(streamed_sog, "MIN_LEVEL_COUNT", 50)
+    scene = shell_scene()
+    written = export_scene(scene, tmp_path / "out" / "lod-meta.json")
+    pose = np.eye(4)
+    pose[:3, 3] = (0.2, -0.3, -4.0)
+    camera = PinholeCamera.from_pose(pose, 256, 256, fy_px=focal_from_fov(40.0, 256))
+    page = PLAYCANVAS_PAGE.replace("FOV", "40").replace("POSITION", "[0.2, -0.3, -4]")
+    files = {path.relative_to(tmp_path / "out").as_posix(): path for path in written}
+    shown = open_page(page, packages=program.parents[4], files=files)
+    ours = to_bytes(our_view(scene, camera))
+    assert psnr(shown.image, ours) > 30, (shown.result, shown.messages)

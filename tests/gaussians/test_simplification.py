@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from octasplat.engine.core.rays import RayBatch
-from octasplat.engine.edit.simplification import simplify
 from octasplat.engine.gaussians.frames import frames_from_normals, quaternions_from_matrices
 from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.simplification import simplify
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import TraceSettings
 
