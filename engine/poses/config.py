@@ -48,6 +48,12 @@ class PosesConfig(Settings):
         "largest features finds alike. Raise it where views are missed and time does not "
         "matter.",
     )
+    quick_look_up_to: Annotated[int, Unit("photographs"), ADVANCED] = Field(
+        500,
+        ge=2,
+        description="Up to so many photographs the quick look is at every pair; above, at those that GPS in "
+        "the photographs, or else a vocabulary of their features, proposes.",
+    )
     partners: Annotated[int, Unit("photographs"), ADVANCED] = Field(
         40,
         ge=2,

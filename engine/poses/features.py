@@ -19,11 +19,13 @@ from octasplat.engine.poses.config import (
     PRESELECTION_MATCHES,
     PosesConfig,
 )
+from octasplat.engine.poses.pair_proposals import propose_pairs
 from octasplat.engine.poses.pairs import (
     Pair,
     all_pairs,
     batch_pairs,
     largest_features,
+    pair_count,
     select_pairs,
 )
 
@@ -166,7 +168,10 @@ def match_pairs(
 def preselect_pairs(
     database: Path, names: Sequence[str], config: PosesConfig, *, threads: int, on_count: OnCount
 ) -> list[Pair]:
-    """Return pairs worth matching, by matching only the largest features of all photographs.
+    """Return pairs worth matching, by matching only the largest features of photographs.
+
+    All pairs are looked at so, or in a large capture those that something proposes, see
+    :mod:`octasplat.engine.poses.pair_proposals`.
 
     Args:
         database: with features; is only read.
@@ -185,23 +190,29 @@ def preselect_pairs(
     # the quick look needs no geometry, only counts
     verification = pycolmap.TwoViewGeometryOptions()
     verification.min_num_inliers = _MIN_PRESELECTION_INLIERS
+    count = len(names)
+    if count <= config.quick_look_up_to:
+        proposed = all_pairs(count)
+    else:
+        proposed = propose_pairs(database, small, count, seed=config.seed, threads=threads)
     alike: dict[Pair, int] = {}
-    looked = unlike = 0
-    for some in batch_pairs(all_pairs(len(names)), _PRESELECTION_PAIRS_PER_BATCH):
+    looked = unlike = pair_count(count) - len(proposed)
+    on_count(unlike)
+    for some in batch_pairs(proposed, _PRESELECTION_PAIRS_PER_BATCH):
         _match_pairs(small, names, some, options, verification)
         with pycolmap.Database.open(small) as found:
             ids, counts = found.read_num_matches()
             found.clear_matches()
-        for pair_id, count in zip(ids, counts, strict=True):
+        for pair_id, matches in zip(ids, counts, strict=True):
             first, second = pycolmap.pair_id_to_image_pair(pair_id)
-            alike[first - 1, second - 1] = count
+            alike[first - 1, second - 1] = matches
         looked += len(some)
-        unlike = looked - sum(count >= PRESELECTION_MATCHES for count in alike.values())
+        unlike = looked - sum(matches >= PRESELECTION_MATCHES for matches in alike.values())
         on_count(unlike)
     small.unlink()
     return select_pairs(
         alike,
-        len(names),
+        count,
         min_matches=PRESELECTION_MATCHES,
         partners=config.partners,
         neighbours=config.neighbours,

@@ -10,6 +10,16 @@ Pair = tuple[int, int]
 _TILE = 8
 
 
+def pair_count(count: int) -> int:
+    """Return the number of pairs of ``count`` photographs."""
+    return count * (count - 1) // 2
+
+
+def neighbor_pairs(count: int, neighbours: int) -> set[Pair]:
+    """Return each photograph with those that follow it by name, the lower index first."""
+    return {(a, b) for a in range(count) for b in range(a + 1, min(a + 1 + neighbours, count))}
+
+
 def all_pairs(count: int) -> list[Pair]:
     """Return every pair of ``count`` photographs, the lower index first."""
     return list(combinations(range(count), 2))
@@ -30,7 +40,7 @@ def select_pairs(
         partners: most pairs of one photograph, the best ones; another's choice may add to them.
         neighbours: in the order of names, on either side, in any case.
     """
-    kept = {(a, b) for a, b in all_pairs(count) if b - a <= neighbours}
+    kept = neighbor_pairs(count, neighbours)
     of: list[list[tuple[int, Pair]]] = [[] for _ in range(count)]
     for pair, matches in match_counts.items():
         if matches >= min_matches:
@@ -56,7 +66,22 @@ def largest_features(keypoints: Float32[np.ndarray, "n 6"], count: int) -> Int64
     return kept
 
 
-def pairs_with(photographs: Sequence[int], count: int, excluded: Iterable[Pair]) -> list[Pair]:
-    """Return pairs of ``photographs`` with any other, except those in ``excluded``."""
-    wanted = {(min(a, b), max(a, b)) for a in photographs for b in range(count) if a != b}
+def pairs_with(
+    photographs: Sequence[int], count: int, excluded: Iterable[Pair], *, within: int | None = None
+) -> list[Pair]:
+    """Return pairs of ``photographs`` with any other, except those in ``excluded``.
+
+    Args:
+        photographs: some of them.
+        count: photographs in all.
+        excluded: pairs to leave out.
+        within: only those so near by name; None for all.
+    """
+    reach = count if within is None else within
+    wanted = {
+        (min(a, b), max(a, b))
+        for a in photographs
+        for b in range(max(0, a - reach), min(count, a + reach + 1))
+        if a != b
+    }
     return sorted(wanted - set(excluded))

@@ -33,7 +33,8 @@ from octasplat.engine.poses.features import (
     preselect_pairs,
 )
 from octasplat.engine.poses.incremental_mapping import map_photographs, model_rank
-from octasplat.engine.poses.pairs import Pair, all_pairs, pairs_with
+from octasplat.engine.poses.pair_proposals import PROPOSALS_PER_PHOTOGRAPH
+from octasplat.engine.poses.pairs import Pair, all_pairs, pair_count, pairs_with
 from octasplat.engine.poses.workspace import link_photographs, progress_stage
 
 MIN_RECOMMENDED_SIDE_PX = 480
@@ -163,13 +164,16 @@ class PoseSearch:
             )
 
     def _match(self, database: Path, thorough: bool) -> list[Pair]:
-        pairs = everything = all_pairs(len(self._names))
-        with progress_stage(MATCHES, len(everything), self._progress) as at:
-            if len(self._names) > self._config.exhaustive_up_to:
+        count = len(self._names)
+        total = pair_count(count)
+        with progress_stage(MATCHES, total, self._progress) as at:
+            if count > self._config.exhaustive_up_to:
                 pairs = preselect_pairs(
                     database, self._aliases, self._config, threads=self._threads, on_count=at
                 )
-            unlike = len(everything) - len(pairs)
+            else:
+                pairs = all_pairs(count)
+            unlike = total - len(pairs)
             match_pairs(
                 database,
                 self._aliases,
@@ -207,10 +211,15 @@ class PoseSearch:
     def _register_remaining(
         self, database: Path, best: Any, matched: list[Pair], at: Callable[[int], None]
     ) -> Any:
-        """Register photographs that were left out: matched with all others, with fewer matches required."""
+        """Register photographs that were left out, with fewer matches required.
+
+        They are matched with all others, in a large capture with those that are near by name.
+        """
         posed = set() if best is None else {number - 1 for number in best.reg_image_ids()}
-        rest = [k for k in range(len(self._names)) if k not in posed]
-        more = pairs_with(rest, len(self._names), matched)
+        count = len(self._names)
+        rest = [k for k in range(count) if k not in posed]
+        is_large = count > self._config.quick_look_up_to
+        more = pairs_with(rest, count, matched, within=PROPOSALS_PER_PHOTOGRAPH if is_large else None)
         if more:
             match_pairs(
                 database,

@@ -6,6 +6,7 @@ the first calls of a test are checked, and fewer and fewer of those that follow.
 
 import functools
 import inspect
+import sys
 import threading
 from collections.abc import Callable
 from dataclasses import is_dataclass
@@ -61,7 +62,7 @@ def _check_some_calls_of(function: Callable[..., Any], typechecker: Any) -> Call
         if test != _test:
             test, calls = _test, 0
         calls += 1
-        if not is_checked(calls):
+        if not is_checked(calls) or sys.is_finalizing():
             return function(*arguments, **named)
         if with_checks is None:
             with _LOCK:

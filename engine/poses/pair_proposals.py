@@ -1,0 +1,106 @@
+"""Proposals of pairs for the quick look in large captures, where all pairs would be too many.
+
+By GPS where the photographs have it, else by a vocabulary of the capture's own features, both by COLMAP
+("A Vote-and-Verify Strategy for Fast Spatial Verification in Image Retrieval", Schönberger et al., ACCV
+2016, describes its index); neighbors by name always. The quick look decides.
+"""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float32
+
+from octasplat.engine.poses.pairs import Pair, neighbor_pairs
+
+PROPOSALS_PER_PHOTOGRAPH = 100
+"""Most photographs that one proposes; others may propose it."""
+NEIGHBORS_BY_NAME = 10
+MIN_GPS_SHARE = 0.9
+"""Share of the photographs that must have GPS for it to propose alone."""
+MAX_DISTANCE_M = 1e6
+"""Only the number of the nearest counts."""
+TRAINING_DESCRIPTORS = 100_000
+"""Features that the vocabulary is learnt from, drawn at random."""
+MAX_WORDS = 4096
+DESCRIPTORS_PER_WORD = 8
+CLUSTERING_ITERATIONS = 10
+_EMBEDDING_BITS = 64
+
+
+def propose_pairs(database: Path, small: Path, count: int, *, seed: int, threads: int) -> list[Pair]:
+    """Return pairs of photographs that may be alike, the lower index first, in order.
+
+    Args:
+        database: with the photographs, and with their GPS if they have any.
+        small: the same photographs with their largest features only.
+        count: photographs in all.
+        seed: of the vocabulary.
+        threads: to use for GPS; -1 means all cores.
+    """
+    found = neighbor_pairs(count, NEIGHBORS_BY_NAME)
+    with pycolmap.Database.open(database) as photographs:
+        by_gps = photographs.num_pose_priors() >= MIN_GPS_SHARE * count
+        if by_gps:
+            found |= _nearest_by_gps(photographs, threads)
+    if not by_gps:
+        found |= _alike_by_vocabulary(small, count, seed)
+    return sorted(found)
+
+
+def _nearest_by_gps(photographs: "pycolmap.Database", threads: int) -> set[Pair]:
+    options = pycolmap.SpatialPairingOptions()
+    options.max_num_neighbors = PROPOSALS_PER_PHOTOGRAPH
+    options.max_distance = MAX_DISTANCE_M
+    options.num_threads = threads
+    return _as_pairs(pycolmap.SpatialPairGenerator(options, photographs).all_pairs())
+
+
+def _alike_by_vocabulary(small: Path, count: int, seed: int) -> set[Pair]:
+    index_file = small.with_name("vocabulary.bin")
+    with pycolmap.Database.open(small) as photographs:
+        descriptors = _drawn_descriptors(photographs, count, seed)
+        if len(descriptors) < 2 * DESCRIPTORS_PER_WORD:
+            return set()
+        words = min(MAX_WORDS, len(descriptors) // DESCRIPTORS_PER_WORD)
+        options = pycolmap.VisualIndex.BuildOptions()
+        options.num_visual_words = words
+        options.num_iterations = CLUSTERING_ITERATIONS
+        options.num_rounds = 1
+        options.num_threads = 1  # sums are the same on any number of threads then, and so are votes below
+        features = pycolmap.FeatureDescriptorsFloat()
+        features.type = pycolmap.FeatureExtractorType.SIFT
+        features.data = descriptors
+        pycolmap.set_random_seed(seed)
+        index = pycolmap.VisualIndex.create(descriptors.shape[1], _EMBEDDING_BITS)
+        index.build(options, features)
+        index_file.unlink(missing_ok=True)
+        index.write(index_file)
+        pairing = pycolmap.VocabTreePairingOptions()
+        pairing.vocab_tree_path = index_file
+        pairing.num_images = PROPOSALS_PER_PHOTOGRAPH
+        pairing.num_threads = 1
+        found = _as_pairs(pycolmap.VocabTreePairGenerator(pairing, photographs).all_pairs())
+    index_file.unlink()
+    return found
+
+
+def _drawn_descriptors(
+    photographs: "pycolmap.Database", count: int, seed: int
+) -> Float32[np.ndarray, "d 128"]:
+    """Return features drawn evenly from all photographs."""
+    rng = np.random.Generator(np.random.PCG64(seed))
+    each = max(1, TRAINING_DESCRIPTORS // count)
+    drawn = [np.zeros((0, 128), np.float32)]
+    for number in range(1, count + 1):
+        if photographs.exists_descriptors(number):
+            data = photographs.read_descriptors(number).data
+            chosen = rng.permutation(len(data))[:each]
+            drawn.append(data[np.sort(chosen)].astype(np.float32))
+    return np.concatenate(drawn)
+
+
+def _as_pairs(numbers: Iterable[tuple[int, int]]) -> set[Pair]:
+    """Return pairs of the database's numbers as indices, the lower first, without those of one photograph."""
+    return {(min(a, b) - 1, max(a, b) - 1) for a, b in numbers if a != b}

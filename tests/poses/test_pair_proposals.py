@@ -1,0 +1,92 @@
+"""Pairs proposed for the quick look: by GPS, or by a vocabulary of the capture's features; known answers."""
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from octasplat.engine.poses.config import PosesConfig
+from octasplat.engine.poses.features import create_database, preselect_pairs
+from octasplat.engine.poses.pair_proposals import propose_pairs
+from octasplat.engine.poses.pairs import all_pairs, pair_count, pairs_with, select_pairs
+from tests.support.located_scene import write_gps
+from tests.support.tiny_dataset import make_tiny_dataset
+
+COUNT, SEEN, STEP = 60, 240, 60
+"""Photographs along a street, features of each, and by how many the next one sees further."""
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str], np.ndarray]:
+    """Photographs of a street, numbered at random: what each sees overlaps with three on either side."""
+    rng = np.random.default_rng(0)
+    landmarks = rng.integers(0, 120, (COUNT * STEP + SEEN, 128)).astype(np.uint8)
+    place = rng.permutation(COUNT)
+    names = [f"{k:03d}.jpg" for k in range(COUNT)]
+    path = tmp_path_factory.mktemp("street") / "database.db"
+    with pycolmap.Database.open(path) as database:
+        camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 500.0, 640, 480)
+        database.write_camera(camera, use_camera_id=True)
+        for k, at in enumerate(place):
+            image = pycolmap.Image(name=names[k], camera_id=1, image_id=k + 1)
+            database.write_image(image, use_image_id=True)
+            seen = landmarks[at * STEP : at * STEP + SEEN].astype(int) + rng.integers(-2, 3, (SEEN, 128))
+            keypoints = np.concatenate(
+                [rng.uniform(0, 480, (SEEN, 2)), np.tile([2, 0, 0, 2], (SEEN, 1))], axis=1
+            )
+            database.write_keypoints(k + 1, keypoints.astype(np.float32))
+            descriptors = pycolmap.FeatureDescriptors()
+            descriptors.type = pycolmap.FeatureExtractorType.SIFT
+            descriptors.data = np.clip(seen, 0, 255).astype(np.uint8)
+            database.write_descriptors(k + 1, descriptors)
+    return path, names, place
+
+
+def test_vocabulary_proposes_photographs_of_one_place(
+    street: tuple[Path, list[str], np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, names, place = street
+    monkeypatch.setattr("octasplat.engine.poses.pair_proposals.PROPOSALS_PER_PHOTOGRAPH", 12)
+    monkeypatch.setattr("octasplat.engine.poses.pair_proposals.NEIGHBORS_BY_NAME", 1)
+    proposed = propose_pairs(path, path, COUNT, seed=0, threads=1)
+    assert proposed == propose_pairs(path, path, COUNT, seed=0, threads=2)
+    alike = {(a, b) for a, b in all_pairs(COUNT) if abs(place[a] - place[b]) <= 2}
+    assert len(alike & set(proposed)) >= 0.97 * len(alike) and len(proposed) < pair_count(COUNT) / 2
+    assert {(k, k + 1) for k in range(COUNT - 1)} <= set(proposed)
+    assert not path.with_name("vocabulary.bin").exists()
+
+    told: list[int] = []
+    quick = PosesConfig(quick_look_up_to=10, partners=6, neighbours=1)
+    chosen = preselect_pairs(path, names, quick, threads=1, on_count=told.append)
+    whole = preselect_pairs(
+        path, names, PosesConfig(partners=6, neighbours=1), threads=1, on_count=lambda _: None
+    )
+    assert len(set(chosen) & set(whole)) >= 0.97 * len(whole)
+    assert told == sorted(told) and told[0] == pair_count(COUNT) - len(proposed)
+
+
+def test_gps_proposes_what_was_taken_nearby(
+    tmp_path_factory: pytest.TempPathFactory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = make_tiny_dataset(tmp_path_factory, views=12)
+    names = sorted(path.name for path in (scene / "images").iterdir())
+    metres = np.array([[40.0 * ((5 * k) % 12), 0.0, 2.0] for k in range(12)])
+    write_gps(scene, dict(zip(names, metres, strict=True)))
+    create_database(tmp_path / "a.db", scene / "images", names, one_camera=True)
+    monkeypatch.setattr("octasplat.engine.poses.pair_proposals.PROPOSALS_PER_PHOTOGRAPH", 2)
+    monkeypatch.setattr("octasplat.engine.poses.pair_proposals.NEIGHBORS_BY_NAME", 0)
+    found = propose_pairs(tmp_path / "a.db", tmp_path / "none.db", 12, seed=0, threads=1)
+    apart = {pair: abs(metres[pair[0], 0] - metres[pair[1], 0]) for pair in found}
+    assert {pair for pair in all_pairs(12) if abs(metres[pair[0], 0] - metres[pair[1], 0]) == 40} <= set(
+        found
+    )
+    assert max(apart.values()) <= 80
+
+
+def test_pairs_of_neighbors_and_of_those_left_out() -> None:
+    assert select_pairs({}, 5, min_matches=1, partners=2, neighbours=2) == [
+        (0, 1), (0, 2), (1, 2), (1, 3), (2, 3), (2, 4), (3, 4),
+    ]  # fmt: skip
+    assert pairs_with([4], 6, [(3, 4)]) == [(0, 4), (1, 4), (2, 4), (4, 5)]
+    assert pairs_with([4], 6, [(3, 4)], within=2) == [(2, 4), (4, 5)]
