@@ -1,6 +1,6 @@
 // Steps through the pages in headless Chromium. The job comes on stdin as JSON: {name, url, chromium, playwright,
 // shots, seconds, ...}; what the steps found goes to stdout as JSON, with everything that a browser complains of.
-import { readFileSync } from "node:fs";
+import { readFileSync, writeFileSync } from "node:fs";
 import { createRequire } from "node:module";
 import { join } from "node:path";
 
@@ -46,7 +46,8 @@ function steadily(page) {
     return page;
 }
 
-const shot = (page, name, fullPage = true) => page.screenshot({ path: join(job.shots, `${name}.png`), fullPage });
+/** A picture for the eye, where a folder for them is given. */
+const shot = async (page, name, fullPage = true) => { if (job.shots) await page.screenshot({ path: join(job.shots, `${name}.png`), fullPage }); };
 const overflow = (page) => page.evaluate(() => document.documentElement.scrollWidth - document.documentElement.clientWidth);
 
 /** Names of all controls that a screen reader would find nameless. */
@@ -82,21 +83,19 @@ async function faults(page) {
     return violations.filter(({ impact }) => ["serious", "critical"].includes(impact)).map(({ id, nodes }) => `${id}: ${nodes.slice(0, 3).map((node) => node.html.slice(0, 160)).join(" | ")}`);
 }
 
-/** Pictures of a page at both widths, light and dark, and what axe says of them. */
+/** Pictures of a page at both widths, one light and one dark, and what axe says of them; all four where pictures are asked for. */
 async function portray(path, name, prepare = async () => {}) {
     const found = [];
-    for (const width of [1280, 390]) {
-        for (const colorScheme of ["light", "dark"]) {
-            const page = await open({ width, height: 860, colorScheme });
-            await page.goto(`${job.url}${path}`);
-            await prepare(page);
-            await shot(page, `${name}_${width}_${colorScheme}`);
-            found.push(...(await faults(page)).map((fault) => `${width} ${colorScheme} ${fault}`));
-            const wide = await overflow(page);
-            if (wide > 0) found.push(`${width} ${colorScheme} is ${wide} px too wide`);
-            if (width === 1280) found.push(...await nameless(page));
-            await page.context().close();
-        }
+    for (const [width, colorScheme] of [[1280, "light"], [390, "dark"], ...(job.shots ? [[1280, "dark"], [390, "light"]] : [])]) {
+        const page = await open({ width, height: 860, colorScheme });
+        await page.goto(`${job.url}${path}`);
+        await prepare(page);
+        await shot(page, `${name}_${width}_${colorScheme}`);
+        found.push(...(await faults(page)).map((fault) => `${width} ${colorScheme} ${fault}`));
+        const wide = await overflow(page);
+        if (wide > 0) found.push(`${width} ${colorScheme} is ${wide} px too wide`);
+        if (width === 1280) found.push(...await nameless(page));
+        await page.context().close();
     }
     return found;
 }
@@ -252,10 +251,12 @@ const steps = {
         const page = await open();
         await page.goto(`${job.url}/jobs/${job.job}`);
         found.before = await page.textContent("#viewer .veil-text");
+        writeFileSync(join(job.signals, "opened"), "");
         const counted = (words) => page.waitForFunction((words) => document.querySelector("#viewer .count")?.textContent.includes(words), words);
         await counted("sparse points");
         await page.waitForSelector("#viewer[data-ready=yes]");
         await shot(page, "live_points");
+        writeFileSync(join(job.signals, "points"), "");
         await counted("Step 30");
         await page.waitForSelector("#viewer[data-rested=yes]");
         // One change is one drawing of the lines over the scene, however many frames pass until the camera rests.
@@ -666,7 +667,7 @@ const steps = {
             const page = await open({ width: 360, height: 760, colorScheme, hasTouch: true, isMobile: true, deviceScaleFactor: 2 });
             for (const [name, path] of Object.entries({ jobs: "/", job: `/jobs/${job.job}`, new: "/new", sign_in: "/sign-in", missing: "/jobs/00000000-0000-7000-8000-000000000000" })) {
                 await page.goto(job.url + path);
-                if (name === "job") await page.waitForSelector("#viewer[data-ready=yes]");
+                if (name === "job" && colorScheme === "light") await page.waitForSelector("#viewer[data-ready=yes]");
                 await page.evaluate(() => document.querySelectorAll("details").forEach((fold) => { fold.open = true; }));
                 await page.waitForTimeout(400);
                 found.overflow[`${name} ${colorScheme}`] = await overflow(page);

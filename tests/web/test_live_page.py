@@ -62,21 +62,27 @@ def axe() -> str:
 
 
 def test_training_is_watched_in_3d(
-    service: RunningService, browse: Browse, folder: Path, job: uuid.UUID, axe: str
+    service: RunningService, browse: Browse, folder: Path, job: uuid.UUID, axe: str, tmp_path: Path
 ) -> None:
     service.worker.run(job, folder / "run", until=30)
-    states = [
-        threading.Timer(
-            seconds,
-            service.worker.show_live,
-            (job, folder / "state.ply", folder / "run" / "views.json"),
-            {"step": step, "gaussians": 200},
-        )
-        for seconds, step in ((8.0, 0), (20.0, 30))
-    ]
-    for state in states:
-        state.start()
-    found = browse("live", service.url, job=str(job), axe=axe)
+    is_over = threading.Event()
+
+    def tell_states() -> None:
+        for signal, step in (("opened", 0), ("points", 30)):
+            while not (tmp_path / signal).exists():  # what the page has seen so far
+                if is_over.wait(0.05):
+                    return
+            service.worker.show_live(
+                job, folder / "state.ply", folder / "run" / "views.json", step=step, gaussians=200
+            )
+
+    states = threading.Thread(target=tell_states)
+    states.start()
+    try:
+        found = browse("live", service.url, job=str(job), axe=axe, signals=str(tmp_path))
+    finally:
+        is_over.set()
+        states.join()
     assert found["complaints"] == [] and found["faults"] == []
     assert found["before"] == "The scene appears here as soon as the poses of the photographs are known."
     assert found["count"] == "Step 30, 200 Gaussians"

@@ -24,8 +24,8 @@ pytestmark = [pytest.mark.tools, pytest.mark.heavy]
 
 VIEWS = 8
 OPTIONS = {
-    "train.iterations": 600,
-    "train.max_gaussians": 1500,
+    "train.iterations": 300,
+    "train.max_gaussians": 800,
     "train.rays_per_batch": 1024,
     "train.initial_points": 600,
     "train.probe_rays": 256,
@@ -49,7 +49,7 @@ class Flow:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("generated") / "still life"
-    config = SyntheticDatasetConfig(views=VIEWS, width_px=96, height_px=72, samples_per_side=2, points=800)
+    config = SyntheticDatasetConfig(views=VIEWS, width_px=64, height_px=48, samples_per_side=1, points=800)
     write_synthetic_dataset(root, config)
     (root / "clip.MOV").write_bytes(b"film")
     return root
@@ -132,7 +132,7 @@ def test_form_submits_filled_values(flow: Flow) -> None:
     options = job["options"]
     assert job["label"] == "a still life"
     assert options["preset"] == "fast" and options["poses"] == "given" and options["test_every"] == 4
-    assert options["train"]["iterations"] == 600 and options["train"]["rays_per_batch"] == 1024
+    assert options["train"]["iterations"] == 300 and options["train"]["rays_per_batch"] == 1024
     # Of the preset, as the field was left empty.
     assert options["train"]["sh_degree_interval"] == preset("fast").sh_degree_interval
     assert flow.facts["iterationsHint"] == str(preset("fast").iterations)  # the hint follows the preset
@@ -156,7 +156,7 @@ def test_job_page_follows_progress_to_end(watched: dict[str, Any]) -> None:
     assert watched["stages"], "no stage was shown by its name"
     assert watched["liveCurves"] == 3 and watched["curves"] == 3
     assert "held-out views" in watched["figures"][0] and "training rays" in watched["figures"][0]
-    assert "Trained 600 iterations in" in watched["log"] and "Attempt 1" in watched["log"]
+    assert "Trained 300 iterations in" in watched["log"] and "Attempt 1" in watched["log"]
     assert watched["preview"]
     assert watched["view"]["deviation"] > 15  # there is a picture in the viewer
     assert watched["nameless"] == []
@@ -189,10 +189,10 @@ def test_stage_form_renders_with_added_mesh(
     assert before.meshes[0].shape == "sphere" and before.lights[0].kind == "directional"
     thing, floor = stage.meshes
     assert thing.file == "x.obj" and floor.shape == "plane" and stage.lights[0].kind == "rectangle"
-    assert thing.on is not None and thing.on.pixel == pytest.approx((0.25 * 96, 0.745 * 72), abs=1)
+    assert thing.on is not None and thing.on.pixel == pytest.approx((0.25 * 64, 0.745 * 48), abs=1)
     assert found["refused"].startswith("'sky.hdr' is not an image") and found["refused"].count("sky.hdr") == 1
-    assert found["preview"] == [96, 72] and found["took"].startswith("The preview took ")
-    assert len(found["pictures"]) == 2 and set(found["pictures"]) == {96}
+    assert found["preview"] == [64, 48] and found["took"].startswith("The preview took ")
+    assert len(found["pictures"]) == 2 and set(found["pictures"]) == {64}
     job = flow.service.request("GET", f"/v1/jobs/{found['job']}")
     assert (job["kind"], job["source_id"], job["state"]) == ("render", flow.job, "succeeded")
     assert len(job["options"]["stage"]["meshes"]) == 2
