@@ -1,6 +1,7 @@
 """Versions of everything that can change a result, written to ``config.json`` and ``metrics.json``."""
 
 import importlib.metadata
+from functools import cache
 
 from octasplat.engine import __version__
 
@@ -28,4 +29,7 @@ anew under another, rather than gone on with."""
 
 def package_versions() -> dict[str, str]:
     """Return the versions of the project and of the packages that it computes with, by name."""
-    return {"octasplat": __version__, **{name: importlib.metadata.version(name) for name in PACKAGES}}
+    return {"octasplat": __version__, **{name: _installed_version(name) for name in PACKAGES}}
+
+
+_installed_version = cache(importlib.metadata.version)  # which parses the package's files each time

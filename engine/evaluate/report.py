@@ -8,11 +8,12 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32
-from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template, select_autoescape
 
 from octasplat.engine.core.errors import OutputError
 from octasplat.engine.core.georeference import Georeference
@@ -99,14 +100,7 @@ def write_report(
     Raises:
         OutputError: The page cannot be written.
     """
-    environment = Environment(
-        loader=PackageLoader("octasplat.engine.evaluate", package_path=""),
-        autoescape=select_autoescape(["html"]),
-        undefined=StrictUndefined,  # a misspelled name is an error
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    page = environment.get_template("report.html").render(
+    page = _template().render(
         _template_values(title, metrics, events, config, images),
         environment=None if environment_linear is None else _embedded_environment(environment_linear),
         background=None if background_srgb is None else _embedded_map(background_srgb),
@@ -115,6 +109,19 @@ def write_report(
         write_text(path, page)
     except OSError as error:
         raise OutputError(f"Cannot write {path}: {error.strerror or error}.") from error
+
+
+@cache
+def _template() -> Template:
+    """Return the page's template; to compile it takes longer than to fill it in."""
+    environment = Environment(
+        loader=PackageLoader("octasplat.engine.evaluate", package_path=""),
+        autoescape=select_autoescape(["html"]),
+        undefined=StrictUndefined,  # a misspelled name is an error
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("report.html")
 
 
 def _template_values(

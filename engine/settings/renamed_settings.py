@@ -175,6 +175,12 @@ def collect_notices() -> Iterator[list[str]]:
         _collected.reset(token)
 
 
+def _sections(models: Iterable[type[BaseModel]], name: str) -> tuple[type[BaseModel], ...]:
+    """Return the models that the values of a field may be of."""
+    fields = [model.model_fields[name] for model in models if name in model.model_fields]
+    return tuple(part for field in fields for part in submodels(field.annotation))
+
+
 def _replace_names(
     models: tuple[type[BaseModel], ...],
     values: Mapping[str, Any],
@@ -188,12 +194,7 @@ def _replace_names(
     result: dict[str, Any] = {}
     for key, value in values.items():
         name = fields.get(key, key)
-        inner = tuple(
-            part
-            for model in models
-            if name in model.model_fields
-            for part in submodels(model.model_fields[name].annotation)
-        )
+        inner = _sections(models, name) if isinstance(value, Mapping) else ()
         if isinstance(value, Mapping) and inner:
             # The settings of the training need no "train." before them.
             places = (before, after) if name == "train" else (f"{before}{key}.", f"{after}{name}.")
