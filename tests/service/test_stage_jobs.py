@@ -185,7 +185,7 @@ material = { kind = "metal", roughness = 0.3 }
 file = "sky.hdr"
 visible = false
 [integrator]
-samples = 120
+samples = 8
 """
 FRAMES = {"frames": 6, "width_px": 32, "height_px": 24}
 
@@ -236,13 +236,18 @@ async def test_killed_render_job_resumes_to_command_bytes(conninfo: str, tmp_pat
     def worker(name: str) -> None:
         given = {
             "STORAGE": tmp_path / "store", "WORK": tmp_path / name, "FLOOR_BYTES": 0, "THREADS": 1,
-            "HEARTBEAT_SECONDS": 0.4, "STALE_SECONDS": 2.4, "RESCUE_SECONDS": 0.3, "POLL_SECONDS": 0.15,
+            "HEARTBEAT_SECONDS": 0.4, "STALE_SECONDS": 12, "RESCUE_SECONDS": 0.3, "POLL_SECONDS": 0.15,
+            "KIND_MODULES": '["tests.support.frequent_frames"]',
         }  # fmt: skip
         environment = {f"OCTASPLAT_{key}": str(value) for key, value in given.items()}
         workers.append(
             subprocess.Popen(
                 [sys.executable, "-m", "octasplat", "worker", "--queues", "cpu", "--name", name],
-                cwd=ROOT, env={**os.environ, **environment, "DATABASE_URL": conninfo, "OMP_NUM_THREADS": "1"},
+                cwd=ROOT,
+                env={
+                    **os.environ, **environment, "DATABASE_URL": conninfo, "OMP_NUM_THREADS": "1",
+                    "PYTHONPATH": str(ROOT),
+                },
             )
         )  # fmt: skip
 
