@@ -48,6 +48,11 @@ def make_config(**assignments: object) -> ReconstructionConfig:
     return resolve_config("standard", assignments=[f"{k}={json.dumps(v)}" for k, v in values.items()])
 
 
+def make_short_config() -> ReconstructionConfig:
+    """Settings of a run of which only the bytes are of interest."""
+    return make_config(iterations=60, checkpoint_every=10)
+
+
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_tiny_dataset(
@@ -66,6 +71,19 @@ def two_blocks(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[P
 
 
 @pytest.fixture(scope="module")
+def short_blocks(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short run in two blocks that nothing stopped, on one thread."""
+    output = tmp_path_factory.mktemp("short") / "run"
+    return reconstruct(scene, output, make_short_config(), threads=1, blocks=BlockRequest(count=2))
+
+
+@pytest.fixture(scope="module")
+def whole(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run without blocks."""
+    return reconstruct(scene, tmp_path_factory.mktemp("whole") / "run", make_config(), threads=1)
+
+
+@pytest.fixture(scope="module")
 def polished_blocks(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run in two blocks that no training may hold together, so that those near the cut are polished."""
     output = tmp_path_factory.mktemp("polished") / "run"
@@ -77,8 +95,7 @@ def psnr(run: Path) -> float:
     return float(json.loads((run / "metrics.json").read_text())["mean"]["psnr"])
 
 
-def test_two_blocks_are_as_good_as_the_whole(scene: Path, two_blocks: tuple, tmp_path: Path) -> None:
-    whole = reconstruct(scene, tmp_path / "whole", make_config(), threads=1)
+def test_two_blocks_are_as_good_as_the_whole(two_blocks: tuple, whole: Path) -> None:
     assert psnr(two_blocks[0]) > psnr(whole) - MAX_LOSS_DB
     assert not (whole / "blocks").exists()
 
@@ -152,7 +169,7 @@ def stop_at(condition: Callable[[Event], bool]) -> tuple[Callable[[Event], None]
 
 @pytest.mark.parametrize("place", ["coarse", "block_001", "block_002", "finish"])
 def test_stopped_run_ends_with_the_same_bytes(
-    scene: Path, two_blocks: tuple, tmp_path: Path, place: str
+    scene: Path, short_blocks: Path, tmp_path: Path, place: str
 ) -> None:
     run = tmp_path / "run"
 
@@ -162,14 +179,14 @@ def test_stopped_run_ends_with_the_same_bytes(
     listen, should_stop = stop_at(is_there)
     with pytest.raises(CancelledError):
         reconstruct(
-            scene, run, make_config(), threads=2, blocks=BlockRequest(count=2), progress=listen,
+            scene, run, make_short_config(), threads=2, blocks=BlockRequest(count=2), progress=listen,
             should_stop=should_stop,
         )  # fmt: skip
     assert not (run / "scene.ply").exists()
     assert not (run / "blocks" / place / RESULT).exists()
-    reconstruct(scene, run, make_config(), threads=2, resume=True)  # the blocks are remembered
-    assert (run / "scene.ply").read_bytes() == (two_blocks[0] / "scene.ply").read_bytes()
-    assert (run / "background.exr").read_bytes() == (two_blocks[0] / "background.exr").read_bytes()
+    reconstruct(scene, run, make_short_config(), threads=2, resume=True)  # the blocks are remembered
+    assert (run / "scene.ply").read_bytes() == (short_blocks / "scene.ply").read_bytes()
+    assert (run / "background.exr").read_bytes() == (short_blocks / "background.exr").read_bytes()
 
 
 def test_automatic_blocks_of_a_small_scene_are_an_ordinary_run(scene: Path, tmp_path: Path) -> None:
@@ -206,10 +223,9 @@ def test_other_blocks_than_the_run_s_own_are_refused(scene: Path, two_blocks: tu
             reconstruct(scene, two_blocks[0], make_config(), resume=True, blocks=blocks)
 
 
-def test_no_seam_is_seen_around_the_cut(scene: Path, two_blocks: tuple, tmp_path: Path) -> None:
+def test_no_seam_is_seen_around_the_cut(scene: Path, two_blocks: tuple, whole: Path) -> None:
     """What blocks lose against the whole is not more where the Gaussians beside the cut are seen."""
     run, config = two_blocks[0], make_config()
-    whole = reconstruct(scene, tmp_path / "whole", config, threads=1)
     dataset = Dataset.open(scene, run / "cache", test_every=4)
     tracer = make_tracer(config.train.trace, threads=1)
     coarse = load_best(run / "blocks" / "coarse").gaussians

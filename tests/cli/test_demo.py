@@ -16,8 +16,8 @@ ROOT = Path(__file__).resolve().parents[2]
 SIZE = ("--views", 4, "--width", 32, "--height", 24)
 
 
-@pytest.fixture
-def tiny_demo(monkeypatch):
+def make_tiny(monkeypatch):
+    """Let the demo take seconds."""
     settings = (
         "iterations=3",
         "rays_per_batch=64",
@@ -30,6 +30,25 @@ def tiny_demo(monkeypatch):
         update={"resolution": 48, "depth_side": 64, "texture_size": 128}
     )
     monkeypatch.setattr(small_surface, "OPTIONS", coarse)
+
+
+@pytest.fixture
+def tiny_demo(monkeypatch):
+    make_tiny(monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def first_demo(octasplat, tmp_path_factory):
+    """The folder of a finished demo, and what the command printed."""
+    folder = tmp_path_factory.mktemp("demo")
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        make_tiny(monkeypatch)
+        opened = []
+        monkeypatch.setattr(webbrowser, "open", opened.append)
+        result = octasplat("demo", "-o", folder, *SIZE)
+    assert result.exit_code == 0, result.output
+    assert opened == [], "opened without a terminal"
+    return folder, result.stdout
 
 
 def test_demo_scene_only_writes_dataset_only(octasplat, tmp_path):
@@ -72,39 +91,37 @@ make_demo_scene(pathlib.Path(sys.argv[1]), {"views": 4}, quiet=True)
 def test_demo_signal_at_start_leaves_no_files(tmp_path):
     """As it happens on a loaded machine: right after the folder was made."""
     command = [sys.executable, "-c", STOPPED_AT_ONCE, str(tmp_path / "still")]
-    assert subprocess.run(command, cwd=ROOT, check=False, timeout=120).returncode == 143
+    assert subprocess.run(command, cwd=ROOT, check=False, timeout=600).returncode == 143
     assert list(tmp_path.iterdir()) == []
 
 
-def test_demo_is_generated_once_and_names_report(octasplat, tmp_path, tiny_demo, monkeypatch):
+def test_demo_is_generated_once_and_names_report(octasplat, first_demo, tiny_demo, monkeypatch):
+    folder, told = first_demo
+    report = folder / "result" / "report.html"
+    assert report.exists()
+    assert str(report) in told.splitlines()[-1]
+
     opened = []
     monkeypatch.setattr(webbrowser, "open", opened.append)
-    first = octasplat("demo", "-o", tmp_path, *SIZE)
-    assert first.exit_code == 0, first.output
-    report = tmp_path / "result" / "report.html"
-    assert report.exists()
-    assert str(report) in first.stdout.splitlines()[-1]
-    assert opened == [], "opened without a terminal"
-
-    second = octasplat("demo", "-o", tmp_path, *SIZE, "--open")
+    second = octasplat("demo", "-o", folder, *SIZE, "--open")
     assert second.exit_code == 0, second.output
-    assert second.stdout.splitlines() == first.stdout.splitlines()[-1:]
+    assert second.stdout.splitlines() == told.splitlines()[-1:]
     assert opened == [report.as_uri()]
 
 
-def test_demo_resumes_automatically(octasplat, tmp_path, tiny_demo):
-    assert octasplat("demo", "-o", tmp_path, *SIZE).exit_code == 0
+def test_demo_resumes_automatically(octasplat, first_demo, tiny_demo):
+    folder, _ = first_demo
     for name in ("report.html", "viewer.glb"):
-        (tmp_path / "result" / name).unlink()
-    again = octasplat("demo", "-o", tmp_path, *SIZE)
+        (folder / "result" / name).unlink()
+    again = octasplat("demo", "-o", folder, *SIZE)
     assert again.exit_code == 0, again.output
     assert "Training" not in again.stdout
-    assert (tmp_path / "result" / "viewer.glb").exists()
+    assert (folder / "result" / "viewer.glb").exists()
 
 
-def test_demo_with_other_settings_is_refused(octasplat, tmp_path, tiny_demo):
-    assert octasplat("demo", "-o", tmp_path, *SIZE).exit_code == 0
-    other_size = octasplat("demo", "-o", tmp_path, "--views", 5)
+def test_demo_with_other_settings_is_refused(octasplat, first_demo, tiny_demo):
+    folder, _ = first_demo
+    other_size = octasplat("demo", "-o", folder, "--views", 5)
     assert other_size.exit_code == 1 and other_size.stderr.count("\n") == 1
-    other_preset = octasplat("demo", "-o", tmp_path, *SIZE, "--preset", "standard")
+    other_preset = octasplat("demo", "-o", folder, *SIZE, "--preset", "standard")
     assert other_preset.exit_code == 1 and "-o" in other_preset.stderr

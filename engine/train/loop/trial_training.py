@@ -28,7 +28,7 @@ WARM_UP_ITERATIONS, TIMED_ITERATIONS = 10, 50
 MATERIAL_TRIAL_RAYS = 300 * 2048
 """Rays of each of the two trainings that say whether materials are of use."""
 MATERIAL_PROBE_RAYS = 8192
-_MATERIAL_TRIAL_SETTINGS: dict[str, object] = {
+MATERIAL_TRIAL_SETTINGS: dict[str, object] = {
     "iterations": 300,
     "rays_per_batch": 2048,
     "max_gaussians": 4000,
@@ -114,7 +114,7 @@ def material_gain_db(
     probe = draw_probe(dataset, indices, MATERIAL_PROBE_RAYS, color, np.random.default_rng(seed))
     found = []
     for base in (preset("fast"), with_materials(preset("fast"))):
-        config = base.model_copy(update={**_MATERIAL_TRIAL_SETTINGS, "background": background, "seed": seed})
+        config = base.model_copy(update={**MATERIAL_TRIAL_SETTINGS, "background": background, "seed": seed})
         gaussians, shading = _train(
             dataset=dataset,
             config=config,
