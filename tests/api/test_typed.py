@@ -4,6 +4,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from platformdirs import user_cache_path
+
 PROGRAM = Path(__file__).with_name("user_program.py")
 WRONG = """
 import octasplat as osp
@@ -21,11 +23,15 @@ ignore_missing_imports = True
 """
 
 
+CACHE = user_cache_path("octasplat") / "mypy"
+"""Kept from run to run: reading torch takes most of the time, and mypy looks at the contents of files."""
+
+
 def check(program: Path, folder: Path) -> tuple[int, str]:
     (folder / "mypy.ini").write_text(CONFIG)
     command = [
         sys.executable, "-m", "mypy", "--strict", "--follow-imports=silent", "--config-file", "mypy.ini",
-        "--cache-dir", str(folder / "cache"), str(program),
+        "--cache-dir", str(CACHE), str(program),
     ]  # fmt: skip
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     return done.returncode, done.stdout
