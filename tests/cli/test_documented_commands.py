@@ -51,6 +51,8 @@ REPLACED = {
     "surface": {"--texture-size": "128", "--max-triangles": "400"},
 }
 """Values that a command has instead of those of the page, if it has the option."""
+LIT_SURFACE = {"--texture-size": "128", "--max-triangles": "400"}
+"""What a surface with materials has by itself, larger."""
 
 
 def runnable() -> list[DocumentedCommand]:
@@ -160,6 +162,8 @@ def remove(path: Path) -> None:
 def small(words: Sequence[str]) -> list[str]:
     """Return a command with options that keep it small."""
     options, replaced = SMALLER.get(words[0], {}), REPLACED.get(words[0], {})
+    if words[0] == "surface" and "--materials" in words:
+        options, replaced = {**options, **LIT_SURFACE}, {}
     found: list[str] = []
     before = ""
     for word in words:
