@@ -16,19 +16,32 @@ from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussia
 from octasplat.engine.render.environment_files import write_environment
 from octasplat.engine.render.image_files import read_image
 from octasplat.engine.runs.viewer_glb import upright_turn
+from tests.support.tiny_dataset import make_tiny_dataset
 
 ORIGIN = (500_000.0, 5_400_000.0, 250.0)
+
+
+def moved_far(scene: Path, folder: Path) -> Path:
+    """Copy photographs into a folder, with a model in map coordinates."""
+    root = folder / scene.name
+    shutil.copytree(scene, root)
+    model = pycolmap.Reconstruction(str(root / "sparse/0"))
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), np.array(ORIGIN)))
+    model.write_binary(str(root / "sparse/0"))
+    return root
 
 
 @pytest.fixture(scope="module")
 def far_scene(run, tmp_path_factory) -> Path:
     """The photographs of the run with a model in map coordinates."""
-    root = tmp_path_factory.mktemp("far") / run.scene.name
-    shutil.copytree(run.scene, root)
-    model = pycolmap.Reconstruction(str(root / "sparse/0"))
-    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), np.array(ORIGIN)))
-    model.write_binary(str(root / "sparse/0"))
-    return root
+    return moved_far(run.scene, tmp_path_factory.mktemp("far"))
+
+
+@pytest.fixture(scope="module")
+def others(tmp_path_factory) -> tuple[Path, Path]:
+    """Few and small photographs of the same things, and the same far away."""
+    near = make_tiny_dataset(tmp_path_factory, views=3, width_px=24, height_px=18)
+    return near, moved_far(near, tmp_path_factory.mktemp("far_others"))
 
 
 @pytest.fixture
@@ -53,11 +66,11 @@ def call(octasplat, *arguments: object) -> str:
 
 
 @pytest.mark.parametrize("integrator", ["split-sum", "path"])
-def test_far_run_is_relit_as_at_the_origin(octasplat, runs, run, far_scene, tmp_path, integrator):
+def test_far_run_is_relit_as_at_the_origin(octasplat, runs, others, tmp_path, integrator):
     light = np.linspace(0.1, 3.0, 16 * 32 * 3, dtype=np.float32).reshape(16, 32, 3)
     write_environment(tmp_path / "day.hdr", light)
     options = ("--environment", tmp_path / "day.hdr", "--integrator", integrator, "--samples", 4)
-    for folder, scene, origin in zip(runs, (run.scene, far_scene), ((0.0, 0.0, 0.0), ORIGIN), strict=True):
+    for folder, scene, origin in zip(runs, others, ((0.0, 0.0, 0.0), ORIGIN), strict=True):
         call(octasplat, "relight", folder, *options, "-o", folder.parent / "held_out")
         call(octasplat, "relight", folder, *options, "--other-dataset", scene, "-o", folder.parent / "others")
         centre = np.add(origin, (0.5, -1.0, -4.0)).tolist()
@@ -72,9 +85,9 @@ def test_far_run_is_relit_as_at_the_origin(octasplat, runs, run, far_scene, tmp_
     assert any(np.ptp(read_image(path)) > 0 for path in near)
 
 
-def test_far_run_is_measured_as_at_the_origin(octasplat, runs, run, far_scene):
+def test_far_run_is_measured_as_at_the_origin(octasplat, runs, others):
     found = []
-    for folder, scene in zip(runs, (run.scene, far_scene), strict=True):
+    for folder, scene in zip(runs, others, strict=True):
         call(octasplat, "evaluate", folder)
         call(octasplat, "evaluate", folder, "--scales", "2")
         call(octasplat, "evaluate", folder, "--other-dataset", scene)
