@@ -33,10 +33,10 @@ from benchmarks.view_colors import fitted_colors_picture, nearest_directions, wi
 from benchmarks.view_support import (
     PointDepths,
     Support,
+    gain_if_covered,
     group_errors,
     measure_points,
     measure_support,
-    psnr_if_covered,
     psnr_of,
 )
 from octasplat.engine.core.color import composite_over
@@ -77,7 +77,6 @@ ROWS = {
     "homography": "best homography",
     "local_motion": "best motion of each place",
     "color_and_motion": "smooth gain and motion of each place",
-    "covered": "few-view places as good as others",
     "frozen_colors": "colors as the nearest training camera sees them",
     "degree_0": "without higher harmonics",
     "fitted_colors": "colors fitted to every other pixel of the view",
@@ -147,9 +146,7 @@ def held_out_views(run: Run, stride: int) -> Iterable[View]:
         rendered = run.render(run.tracer, image, index)
         render = quantize_8_bit(rendered.rgb_srgb)
         squared = np.square(render.astype(np.float64) - reference).mean(axis=-1)
-        directions = nearest_directions(
-            run.gaussians.means_world, dataset.views[index].origin_world, cameras
-        )
+        directions = nearest_directions(run.gaussians.means_world, dataset.views[index].origin_world, cameras)
         frozen = run.tracer_of(with_frozen_colors(run.gaussians, directions))
         others = {
             name: psnr(quantize_8_bit(run.render(tracer, image, index).rgb_srgb), reference, weight)
@@ -159,12 +156,7 @@ def held_out_views(run: Run, stride: int) -> Iterable[View]:
             run.tracer, run.gaussians, image, rendered.rgb_srgb, reference, weight
         )
         others["fitted_colors"] = psnr(quantize_8_bit(fitted), reference, weight * left_out)
-        support = measure_support(
-            dataset, run.tracer, image, rendered.depth_median, squared, weight, stride
-        )
-        # as PSNR, by the pixels that were asked alone
-        gain = psnr_if_covered(support) - psnr_of(float(support.errors.mean()))
-        others["covered"] = psnr(render, reference, weight) + gain
+        support = measure_support(dataset, run.tracer, image, rendered.depth_median, squared, weight, stride)
         points = measure_points(dataset, index, rendered.depth_median, squared)
         yield View(dataset.views[index].name, render, reference, weight, others, support, points)
 
@@ -224,7 +216,8 @@ def analyse(run: Run, stride: int, pictures: Path | None) -> dict[str, object]:
     training = _measured(training_views(run, len(run.dataset.test_indices)), None)
     for name, rows in (("held_out", held_out), ("training", training)):
         found[name] = {"mean": _means(list(rows.values())), "views": rows}
-    found["coverage"] = group_errors(support)
+    found["coverage"] = groups = group_errors(support)
+    found["gain_if_covered_db"] = gain_if_covered(groups)
     relative = np.concatenate([part.relative for part in points])
     wrong = np.concatenate([part.wrong for part in points])
     errors = np.concatenate([part.errors for part in points])
@@ -281,6 +274,7 @@ def table(results: Sequence[dict[str, object]]) -> str:
     lines += ["", *_header("training views within 15 degrees: pixels, error, PSNR", results)]
     for name in dict.fromkeys(name for result in results for name in result["coverage"]):  # type: ignore[attr-defined]
         lines.append(_row(name, results, lambda r, name=name: _group(r["coverage"].get(name))))
+    lines.append(_row("dB, were 0 to 2 as good as more", results, _covered))
     lines += ["", *_header("depth at sparse points: median off, wrong, PSNR right / wrong", results)]
     lines.append(_row("", results, lambda r: _depths(r.get("depths"))))
     return "\n".join(lines)
@@ -294,15 +288,18 @@ def _row(title: str, results: Sequence[dict[str, object]], cell: Callable[..., s
     return "| " + " | ".join([title, *(cell(result) for result in results)]) + " |"
 
 
-def _pair(
-    result: dict, key: str, of: Callable[..., float] = float, digits: int = 2
-) -> str:  # type: ignore[type-arg]
+def _pair(result: dict, key: str, of: Callable[..., float] = float, digits: int = 2) -> str:  # type: ignore[type-arg]
     both = [result[part]["mean"].get(key) for part in ("held_out", "training")]
     return " / ".join(f"{of(value):.{digits}f}" for value in both if value is not None)
 
 
 def _group(group: dict[str, float] | None) -> str:
     return "" if group is None else f"{group['pixels']:.0%}, {group['error']:.0%}, {group['psnr']:.1f}"
+
+
+def _covered(result: dict) -> str:  # type: ignore[type-arg]
+    gain = result["gain_if_covered_db"]
+    return "" if gain is None else f"+{gain:.2f}"
 
 
 def _depths(depths: dict[str, float] | None) -> str:
@@ -317,9 +314,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Measure runs, print the tables, and write the JSON."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN")
-    parser.add_argument("--dataset", type=Path, help="the photographs of one run, where they are elsewhere now")
+    parser.add_argument(
+        "--dataset", type=Path, help="the photographs of one run, where they are elsewhere now"
+    )
     parser.add_argument("--json", type=Path, help="all figures, view by view")
-    parser.add_argument("--pictures", type=Path, help="photograph, render and three times the error, side by side")
+    parser.add_argument(
+        "--pictures", type=Path, help="photograph, render and three times the error, side by side"
+    )
     parser.add_argument("--stride", type=int, default=6, help="pixels between two whose coverage is asked")
     parser.add_argument("--threads", type=int, default=0)
     given = parser.parse_args(arguments)

@@ -35,7 +35,9 @@ def nearest_directions(
     return found
 
 
-def with_frozen_colors(gaussians: FlatGaussians, directions_world: Float64[np.ndarray, "n 3"]) -> FlatGaussians:
+def with_frozen_colors(
+    gaussians: FlatGaussians, directions_world: Float64[np.ndarray, "n 3"]
+) -> FlatGaussians:
     """Return the Gaussians with the color that each shows in one direction, from all directions."""
     basis = sh_basis(directions_world, gaussians.sh_degree)
     colors = np.maximum(0.5 + np.einsum("nk,nkc->nc", basis, gaussians.sh), 0)

@@ -19,7 +19,7 @@ COUNT_EDGES = (0, 1, 2, 3, 5, 9, 17)
 """Where the groups of pixels by number of views begin."""
 GROUP_NAMES = ("0", "1", "2", "3 to 4", "5 to 8", "9 to 16", "more")
 FEW_VIEWS = 3
-"""A place that fewer training views see is badly covered."""
+"""A place that fewer training views see is badly covered: the first groups, one for each number."""
 DEPTH_TOLERANCE = 0.03
 """Share of its distance by which the depth of a sparse point is wrong."""
 AROUND_PX = 5
@@ -145,11 +145,27 @@ def group_errors(parts: list[Support]) -> dict[str, dict[str, float]]:
     return found
 
 
-def psnr_if_covered(part: Support) -> float:
-    """Return the PSNR, were pixels that few views see as good as the others; not-a-number if there are none."""
-    poor = (part.counts >= 0) & (part.counts < FEW_VIEWS)
-    rest = part.errors[~poor]
-    return psnr_of(float(rest.mean())) if len(rest) else float("nan")
+def gain_if_covered(groups: dict[str, dict[str, float]]) -> float | None:
+    """Return by how many dB the error would fall, were places that few views see as good as the others.
+
+    Pixels that meet nothing stay as they are.
+
+    Args:
+        groups: of :func:`group_errors`.
+
+    Returns:
+        None where all places are alike.
+    """
+    mean = {name: 10 ** (-group["psnr"] / 10) for name, group in groups.items()}
+    few = [name for name in GROUP_NAMES[:FEW_VIEWS] if name in groups]
+    others = [name for name in GROUP_NAMES[FEW_VIEWS:] if name in groups]
+    if not few or not others:
+        return None
+    share = sum(groups[name]["pixels"] for name in others)
+    good = sum(groups[name]["pixels"] * mean[name] for name in others) / share
+    before = sum(groups[name]["pixels"] * mean[name] for name in groups)
+    after = before - sum(groups[name]["pixels"] * (mean[name] - good) for name in few)
+    return float(10 * np.log10(before / after))
 
 
 def psnr_of(squared_error: float) -> float:

@@ -58,7 +58,10 @@ def test_homography_finds_a_zoom(photograph, weight):
 
     places = np.stack([(y - 35.5) / 1.02 + 35.5, (x - 47.5) / 1.02 + 47.5])
     render = np.stack(
-        [map_coordinates(photograph[..., c].astype(float), places, order=3, mode="nearest") for c in range(3)],
+        [
+            map_coordinates(photograph[..., c].astype(float), places, order=3, mode="nearest")
+            for c in range(3)
+        ],
         axis=-1,
     ).astype(np.float32)
     shift, homography = (fit(render, photograph, weight) for fit in (fit_shift, fit_homography))

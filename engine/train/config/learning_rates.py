@@ -71,6 +71,14 @@ class LearningRates(Settings):
         description="Step of the higher harmonics, of the constant one's. Lower it where colors flicker "
         "between views.",
     )
+    sh_decay: Annotated[float, Unit("share"), EXPERIMENTAL] = Field(
+        0.0,
+        ge=0,
+        le=0.3,
+        description="Share of its value that each step takes from a higher harmonic of a Gaussian that is "
+        "seen, times its degree, so that colors change with the direction only where photographs say so. "
+        "Try 0.002 for single things with many photographs around them; 0 takes nothing.",
+    )
     exposure: Annotated[float, Unit("log gain"), ADVANCED] = Field(
         2e-3,
         ge=0,
