@@ -2,12 +2,13 @@
 
     python -m benchmarks.held_out_error RUN... [--dataset FOLDER] [--json FILE] [--pictures FOLDER]
 
-For each run the held-out views are rendered and held against their photographs as they are, and after one fit
-each: of color, of a smooth gain, of a shift, of a homography, of a motion of each place, and of the colors of all
-Gaussians to every other pixel of the view (measured on the others). Renders without harmonics, and with each
-Gaussian's color as the nearest training camera sees it, show what colors by direction do. Errors are also counted
-by the number of training views that see a place, by depth at sparse points, and by spatial frequency. Training
-views, as many and evenly chosen, stand beside them. ``docs/notes/held_out_error.md`` says how to read it.
+For each run the held-out views are rendered and held against their photographs as they are, and after one
+fit each: of color, of a smooth gain, of a shift, of a homography, of a motion of each place, and of the
+colors of all Gaussians to every other pixel of the view (measured on the others). Renders without harmonics,
+and with each Gaussian's color as the nearest training camera sees it, show what colors by direction do.
+Errors are also counted by the number of training views that see a place, by depth at sparse points, and by
+spatial frequency. Training views, as many and evenly chosen, stand beside them.
+``docs/notes/held_out_error.md`` says how to read it.
 """
 
 import argparse
@@ -21,16 +22,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from benchmarks.picture_fits import (
-    fit_affine_color,
-    fit_homography,
-    fit_local_gain,
-    fit_local_motion,
-    fit_shift,
-)
-from benchmarks.picture_spectrum import BAND_NAMES, error_shares, sharpness_db
+from benchmarks.picture_measures import BAND_NAMES, measure_pair
 from benchmarks.view_colors import fitted_colors_picture, nearest_directions, with_frozen_colors
 from benchmarks.view_support import (
+    GROUP_NAMES,
     PointDepths,
     Support,
     gain_if_covered,
@@ -40,7 +35,7 @@ from benchmarks.view_support import (
     psnr_of,
 )
 from octasplat.engine.core.color import composite_over
-from octasplat.engine.core.psnr import fit_color, psnr
+from octasplat.engine.core.psnr import psnr
 from octasplat.engine.core.rays import ImageRays
 from octasplat.engine.core.threads import threads_in_use, use_threads
 from octasplat.engine.core.writing import write_json
@@ -171,32 +166,8 @@ def training_views(run: Run, count: int) -> Iterable[View]:
 
 
 def measure_pictures(view: View) -> dict[str, object]:
-    """Return what one view's pictures alone say: PSNR after each fit, motions in px, and spectra."""
-    render, reference, weight = view.render, view.reference, view.weight
-
-    def left(picture: Picture) -> float:
-        return psnr(quantize_8_bit(picture), reference, weight)
-
-    shift, homography = (fit(render, reference, weight) for fit in (fit_shift, fit_homography))
-    even = fit_local_gain(render, reference, weight)
-    moved, moved_px = fit_local_motion(render, reference, weight)
-    shown = np.where(weight[..., None] > 0, render, reference)
-    return {
-        "psnr": left(render),
-        "gain_and_offset": left(fit_color(render, reference, weight)),
-        "affine_color": left(fit_affine_color(render, reference, weight)),
-        "local_gain": left(even),
-        "shift": left(shift.picture),
-        "homography": left(homography.picture),
-        "local_motion": left(moved),
-        "color_and_motion": left(fit_local_motion(even, reference, weight)[0]),
-        **view.others,
-        "shift_px": list(shift.shift_px),
-        "homography_corner_px": homography.corner_px,
-        "local_motion_px": moved_px,
-        "sharpness_db": sharpness_db(shown, reference).tolist(),
-        "error_by_band": error_shares(shown, reference).tolist(),
-    }
+    """Return all figures of one view."""
+    return {**measure_pair(view.render, view.reference, view.weight), **view.others}
 
 
 def analyse(run: Run, stride: int, pictures: Path | None) -> dict[str, object]:
@@ -272,7 +243,7 @@ def table(results: Sequence[dict[str, object]]) -> str:
     for number, name in enumerate(BAND_NAMES):
         lines.append(_row(name, results, lambda r, n=number: _pair(r, "error_by_band", lambda v: v[n])))
     lines += ["", *_header("training views within 15 degrees: pixels, error, PSNR", results)]
-    for name in dict.fromkeys(name for result in results for name in result["coverage"]):  # type: ignore[attr-defined]
+    for name in ("nothing met", *GROUP_NAMES):
         lines.append(_row(name, results, lambda r, name=name: _group(r["coverage"].get(name))))
     lines.append(_row("dB, were 0 to 2 as good as more", results, _covered))
     lines += ["", *_header("depth at sparse points: median off, wrong, PSNR right / wrong", results)]

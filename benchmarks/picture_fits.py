@@ -1,9 +1,9 @@
-"""Fits that bring a rendered picture closest to a photograph: color, local gain, shift, homography, local motion.
+"""Fits that bring a rendered picture closest to a photograph: color, gain, shift, homography, local motion.
 
-Each returns the picture after the fit, and most of them the numbers that were found, so that the PSNR which is
-left tells how much one cause costs: what a fit of colors takes away is exposure and color, what a shift of the
-whole picture takes away is the pose, what a homography takes away is pose and lens, and what a motion of each
-place of its own takes away is mostly geometry. Pictures are display values.
+Each returns the picture after the fit, and most of them the numbers that were found, so that the PSNR which
+is left tells how much one cause costs: what a fit of colors takes away is exposure and color, what a shift
+of the whole picture takes away is the pose, what a homography takes away is pose and lens, and what a motion
+of each place of its own takes away is mostly geometry. Pictures are display values.
 """
 
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ class Motion:
 
     Attributes:
         picture: the render after it.
-        matrix: takes a pixel of the photograph to the place of the render that shows the same (pixels about the
+        matrix: takes a pixel of the photograph to the place of the render that shows the same (about the
             middle, in halves of the longer side).
         shift_px: of the middle of the picture, across and down.
         corner_px: largest distance by which a corner moves.
@@ -58,8 +58,8 @@ def fit_affine_color(render: Picture, reference: Picture, weight: Weight) -> Pic
 def fit_local_gain(render: Picture, reference: Picture, weight: Weight, knots: int = GAIN_GRID) -> Picture:
     """Return the render under the gains of each channel, bilinear between knots, that bring it closest.
 
-    ``knots`` across and down lie evenly from edge to edge. Little light around a knot leaves its gain at that of
-    the whole picture.
+    ``knots`` across and down lie evenly from edge to edge. Little light around a knot leaves its gain at
+    that of the whole picture.
     """
     if weight.sum() <= 0:
         return render.copy()
@@ -86,16 +86,16 @@ def fit_shift(render: Picture, reference: Picture, weight: Weight) -> Motion:
 
 
 def fit_homography(render: Picture, reference: Picture, weight: Weight) -> Motion:
-    """Return the render under the homography that brings it closest: its motion by a turn, a plane, a lens."""
+    """Return the render under the homography that brings it closest: a turn, a plane's motion, a zoom."""
     return _fit_motion(render, reference, weight, 8)
 
 
 def fit_local_motion(render: Picture, reference: Picture, weight: Weight) -> tuple[Picture, float]:
-    """Return the render moved at each place by what brings its surroundings closest, and the mean motion in px.
+    """Return the render with each place moved to where its surroundings fit, and the mean motion in px.
 
-    Surroundings are Gaussian windows (:data:`LOCAL_SIGMA_PX`), so that the motion is smooth; it is found by the
-    steps of Lucas and Kanade ("An Iterative Image Registration Technique with an Application to Stereo Vision",
-    IJCAI 1981) and is at most :data:`MAX_LOCAL_PX`.
+    Surroundings are Gaussian windows (:data:`LOCAL_SIGMA_PX`), so that the motion is smooth; it is found by
+    the steps of Lucas and Kanade ("An Iterative Image Registration Technique with an Application to Stereo
+    Vision", IJCAI 1981) and is at most :data:`MAX_LOCAL_PX`.
     """
     grid = np.indices(weight.shape, np.float64)
     flow = np.zeros_like(grid)

@@ -1,4 +1,4 @@
-"""A view with other colors of the Gaussians: of no direction, of the nearest training camera, or fitted to it."""
+"""A view with other colors of the Gaussians: those that the nearest training camera sees, or fitted ones."""
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
@@ -23,7 +23,7 @@ def nearest_directions(
     viewer_world: Float64[np.ndarray, "3"],
     cameras_world: Float64[np.ndarray, "v 3"],
 ) -> Float64[np.ndarray, "n 3"]:
-    """Return the unit direction to each mean from that camera which sees it most nearly from the viewer's side."""
+    """Return the unit direction to each mean from the camera whose direction is nearest to the viewer's."""
     means = means_world.astype(np.float64)
     wanted = _unit(means - viewer_world)
     best, found = np.full(len(means), -2.0), np.empty_like(wanted)
@@ -52,11 +52,11 @@ def fitted_colors_picture(
     reference: Float32[np.ndarray, "h w 3"],
     weight: Float32[np.ndarray, "h w"],
 ) -> tuple[Float32[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """Return the picture with the Gaussians' colors fitted to every other pixel, and which pixels those are not.
+    """Return the picture with colors fitted to every other pixel, and which pixels were left out.
 
-    What is left on the pixels that were not fitted is what colors cannot repair: geometry, opacity, and detail
-    finer than the Gaussians. The colors of all Gaussians change by least squares, held at what they are where
-    few pixels say anything.
+    What is left on the pixels that were not fitted is what colors cannot repair: geometry, opacity, and
+    detail finer than the Gaussians. The colors of all Gaussians change by least squares, held at what they
+    are where few pixels say anything.
 
     Args:
         tracer: built around the Gaussians.

@@ -30,8 +30,8 @@ class Support:
     """Pixels of a view on a grid.
 
     Attributes:
-        counts: training views that see the place which each pixel shows, within :data:`MAX_ANGLE_DEG`; -1 where
-            it shows none.
+        counts: training views that see the place which each pixel shows, within :data:`MAX_ANGLE_DEG`; -1
+            where it shows none.
         errors: the pixels' squared errors, means over the channels.
     """
 
@@ -129,7 +129,7 @@ def measure_points(
 
 
 def group_errors(parts: list[Support]) -> dict[str, dict[str, float]]:
-    """Return share of the pixels, share of the squared error, and PSNR of each group of pixels, by its name."""
+    """Return the shares of the pixels and of the squared error, and the PSNR, of each group by its name."""
     counts = np.concatenate([part.counts for part in parts])
     errors = np.concatenate([part.errors for part in parts])
     group = np.searchsorted(COUNT_EDGES, counts, side="right") - 1

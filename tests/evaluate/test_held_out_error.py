@@ -1,4 +1,4 @@
-"""The causes of the held-out error: known answers for scenes of a wall and for a run of generated photographs."""
+"""The causes of the held-out error: known answers for a wall, and a run of generated photographs."""
 
 import json
 from dataclasses import replace

@@ -9,7 +9,7 @@ from benchmarks.picture_fits import (
     fit_local_motion,
     fit_shift,
 )
-from benchmarks.picture_spectrum import BAND_NAMES, band_powers, error_shares, sharpness_db
+from benchmarks.picture_measures import BAND_NAMES, band_powers, error_shares, sharpness_db
 from octasplat.engine.core.psnr import psnr
 
 HEIGHT, WIDTH = 72, 96
