@@ -18,6 +18,7 @@ class LearningRates(Settings):
     """
 
     former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.LEARNING_RATES
+    added_settings: ClassVar = frozenset({"sh_decay"})
 
     mean: Annotated[float, Unit("mean_unit"), ADVANCED] = Field(
         0.14,
