@@ -7,7 +7,23 @@ or killed goes on where it was.
 """
 
 from octasplat.engine.pipeline.block_request import BlockRequest
+from octasplat.engine.pipeline.block_steps import (
+    PlanBlocks,
+    TrainBlock,
+    block_files,
+    missing_blocks,
+    planned_blocks,
+)
 from octasplat.engine.pipeline.reconstruction import reconstruct
 from octasplat.engine.pipeline.run import OnStep
 
-__all__ = ["BlockRequest", "OnStep", "reconstruct"]
+__all__ = [
+    "BlockRequest",
+    "OnStep",
+    "PlanBlocks",
+    "TrainBlock",
+    "block_files",
+    "missing_blocks",
+    "planned_blocks",
+    "reconstruct",
+]

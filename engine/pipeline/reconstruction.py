@@ -1,7 +1,7 @@
 """The reconstruction job as a list of steps."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from octasplat.engine.blocks.piece_settings import require_blocks_possible
@@ -14,7 +14,7 @@ from octasplat.engine.pipeline.block_request import BlockRequest, keep_request
 from octasplat.engine.pipeline.dataset_steps import FindPoses, OpenDataset
 from octasplat.engine.pipeline.output_folder import claim_output, release_on_refusal
 from octasplat.engine.pipeline.result_steps import EvaluateStep, ExportStep
-from octasplat.engine.pipeline.run import OnStep, ReconstructionRun, run_steps
+from octasplat.engine.pipeline.run import OnStep, ReconstructionRun, Step, run_steps
 from octasplat.engine.pipeline.run_lock import lock_run_folder
 from octasplat.engine.pipeline.start_scene import keep_start
 from octasplat.engine.pipeline.train_step import TrainStep
@@ -38,6 +38,7 @@ def reconstruct(
     on_step: OnStep | None = None,
     blocks: BlockRequest | None = None,
     start_from: Path | None = None,
+    steps: Sequence[Step] = RESULT_STEPS,
 ) -> Path:
     """Reconstruct ``scene`` into the folder ``output`` and return it.
 
@@ -59,6 +60,7 @@ def reconstruct(
         start_from: a run, finished or stopped, or a file of Gaussians to begin with instead of the sparse
             points; None, with ``resume``, goes on as the run was begun.
         blocks: how to train in blocks; None trains the scene as a whole or, with ``resume``, as it was begun.
+        steps: what is done once the photographs are open, where that is only a part of the run.
 
     Raises:
         DatasetError: the photographs or the model cannot be used, or no poses be found.
@@ -97,14 +99,15 @@ def reconstruct(
                 on_step=on_step,
                 blocks=blocks,
             ),
+            steps,
             is_new=is_new,
             is_made=is_made,
         )
     return output
 
 
-def _run_all_steps(run: ReconstructionRun, *, is_new: bool, is_made: bool) -> None:
-    """Execute all steps of a run whose folder is claimed."""
+def _run_all_steps(run: ReconstructionRun, steps: Sequence[Step], *, is_new: bool, is_made: bool) -> None:
+    """Open the photographs of a run whose folder is claimed, and execute steps."""
     began, output = time.perf_counter(), run.output
     recorded = read_views(output / VIEWS) if (output / VIEWS).exists() else None
     # held back until the photographs are known to be the same
@@ -116,9 +119,10 @@ def _run_all_steps(run: ReconstructionRun, *, is_new: bool, is_made: bool) -> No
     try:
         with release_on_refusal(output, is_new=is_new, is_made=is_made):
             run_steps(DATASET_STEPS, run)
-        run_steps(RESULT_STEPS, run)
+        run_steps(steps, run)
         run.dataset.release_pages()
-        report(RunFinished(_result_names(output), time.perf_counter() - began))
+        if steps is RESULT_STEPS:
+            report(RunFinished(_result_names(output), time.perf_counter() - began))
     finally:
         events.close()
 

@@ -1,14 +1,11 @@
 """The training step: its result is the scene, and what the training learnt beside it."""
 
-import shutil
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
 
-from octasplat.engine.blocks.block_scene import COARSE, train_in_blocks
-from octasplat.engine.blocks.piece_training import BlockWork
-from octasplat.engine.core.events import EventListener, Noted, Warned, ignore_events
+from octasplat.engine.core.events import EventListener, Noted, Warned
 from octasplat.engine.core.progress import PhaseClock, phase
 from octasplat.engine.core.threads import use_threads
 from octasplat.engine.core.writing import write_json
@@ -21,22 +18,19 @@ from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.engine.gaussians.materials import reflective_fraction
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.scene_metadata import SceneMetadata
+from octasplat.engine.pipeline.block_steps import count_blocks, train_all_blocks
 from octasplat.engine.pipeline.run import ReconstructionRun
 from octasplat.engine.pipeline.start_scene import has_start, started_state
 from octasplat.engine.render.environment_files import write_background_map, write_environment
 from octasplat.engine.render.shots import training_pixel_angle
 from octasplat.engine.runs.run_folder import (
     BACKGROUND,
-    BLOCKS,
-    CACHE,
     CHECKPOINTS,
     ENVIRONMENT_EXR,
     ENVIRONMENT_HDR,
     PLAN,
     SCENE,
     TRAINING,
-    found_model_folder,
-    open_run_dataset,
 )
 from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.shading.protocol import ShadingModel
@@ -87,8 +81,8 @@ class TrainStep:
 
 
 def _train(run: ReconstructionRun, clock: PhaseClock) -> FlatGaussians:
-    if run.blocks is not None and (count := run.blocks.resolve(run.config, run.dataset)) > 1:
-        return _train_in_blocks(run, count, run.blocks.most_gaussians)
+    if (count := count_blocks(run)) > 1:
+        return _train_in_blocks(run, count)
     if not any((run.output / CHECKPOINTS).glob("*.npz")):
         _warn_of_useless_materials(run)  # before the plan, which shares out what is left of the time
     config = _plan_settings(run, clock)
@@ -102,39 +96,17 @@ def _train(run: ReconstructionRun, clock: PhaseClock) -> FlatGaussians:
     return gaussians
 
 
-def _train_in_blocks(run: ReconstructionRun, count: int, most_gaussians: int | None) -> FlatGaussians:
+def _train_in_blocks(run: ReconstructionRun, count: int) -> FlatGaussians:
     """Return the scene trained in so many blocks; writes the facts on it."""
-    dataset, config = run.dataset, run.config.train
-    exposure, exposure_changes = resolve_exposure(config.exposure, dataset, has_materials=False)
-    if exposure_changes is not None:
-        run.progress(Warned(f"{exposure_changes} That is learnt; exposure=false leaves it out."))
-    work = BlockWork(
-        dataset,
-        config.model_copy(update={"exposure": exposure}),
-        run.output / BLOCKS,
-        run.threads,
-        run.progress,
-        run.should_stop,
-    )
-    coarse_cache = run.output / BLOCKS / COARSE / CACHE
-
-    def open_coarse(side_px: int) -> Dataset:
-        smaller = run.config.model_copy(update={"max_side": side_px})
-        return open_run_dataset(
-            run.scene, run.output, smaller, run.threads, ignore_events,
-            model_folder=found_model_folder(run.output), cache=coarse_cache,
-        )  # fmt: skip
-
-    scene = train_in_blocks(work, count, open_coarse, most_gaussians=most_gaussians)
-    shutil.rmtree(coarse_cache, ignore_errors=True)
+    scene = train_all_blocks(run, count)
     _write_learnt_light(scene.shading, scene.gaussians, run.output, run.progress)
     record: dict[str, object] = {
         "seconds": sum(piece.get("seconds", 0.0) for piece in scene.record.values()),
         "iterations": sum(int(piece.get("iterations", 0)) for piece in scene.record.values()),
         "pieces": scene.record,
     }
-    nearest_world = camera_clearances(dataset.viewpoints, dataset.points)
-    _write_record(record, dataset, scene.shading, nearest_world, run.output)
+    nearest_world = camera_clearances(run.dataset.viewpoints, run.dataset.points)
+    _write_record(record, run.dataset, scene.shading, nearest_world, run.output)
     return scene.gaussians
 
 

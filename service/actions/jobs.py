@@ -29,6 +29,7 @@ from octasplat.workers.db.holds import read_holds
 from octasplat.workers.db.postgres_text import storable_text
 from octasplat.workers.db.rows import Job, JobState
 from octasplat.workers.queue import jobs as rows
+from octasplat.workers.queue.block_jobs import cancel_job as cancel_job_row
 from octasplat.workers.queue.jobs import JobOrder
 from octasplat.workers.queue.usage_figures import running_by_queue
 from octasplat.workers.worker.job_kinds import get_job_kind
@@ -156,7 +157,7 @@ async def cancel_job(
         await fetch_visible_job(connection, principal, job_id)
 
         async def cancel() -> uuid.UUID:
-            await rows.cancel_job(connection, service.job_queue, job_id)
+            await cancel_job_row(connection, service.job_queue, job_id)
             return job_id
 
         named = fingerprint("cancel", str(job_id))
@@ -184,7 +185,7 @@ async def delete_job(
     async with service.pool.connection() as connection:
         job = await fetch_visible_job(connection, principal, job_id)
         if cancel and not job.is_over:
-            job = await rows.cancel_job(connection, service.job_queue, job_id)
+            job = await cancel_job_row(connection, service.job_queue, job_id)
     if cancel and not job.is_over:
         detail = "The job is being stopped; repeat the request in a moment."
         raise ProblemError(409, "stopping", detail, retry_seconds=BUSY_RETRY_SECONDS)

@@ -95,8 +95,8 @@ async def job_counts(service: Service, principal: Principal) -> dict[str, int]:
     async with service.pool.connection() as connection:
         cursor = await connection.execute(
             """
-            SELECT state, count(*) AS n FROM jobs WHERE %(owner)s::text IS NULL OR owner = %(owner)s
-            GROUP BY state
+            SELECT state, count(*) AS n FROM jobs
+            WHERE root_id IS NULL AND (%(owner)s::text IS NULL OR owner = %(owner)s) GROUP BY state
             """,
             {"owner": principal.visible_owner},
         )

@@ -14,8 +14,9 @@ from octasplat.workers.db.locks import ROW_SECONDS, try_lock_recovery
 from octasplat.workers.db.rows import Job
 from octasplat.workers.queue import attempts
 from octasplat.workers.queue.attempts import Attempt, claim
+from octasplat.workers.queue.block_jobs import cancel_job
 from octasplat.workers.queue.job_endings import recover_attempt
-from octasplat.workers.queue.jobs import cancel_job, get_job
+from octasplat.workers.queue.jobs import get_job
 from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
 from octasplat.workers.queue.protocol import NewEntry
 from octasplat.workers.queue.recovery import StalledAttempts, recover_stalled_jobs

@@ -18,7 +18,8 @@ from psycopg.rows import class_row
 
 from octasplat.workers.db.connections import Connection, open_pool, select_columns
 from octasplat.workers.db.rows import Artifact, Job, JobEvent
-from octasplat.workers.queue.jobs import NewJob, artifacts_of, cancel_job, create_job, retry_job
+from octasplat.workers.queue.block_jobs import cancel_job
+from octasplat.workers.queue.jobs import NewJob, artifacts_of, create_job, retry_job
 from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
 from octasplat.workers.storage.factory import open_storage
 from tests.support.releases import ROOT, Release

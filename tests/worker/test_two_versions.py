@@ -18,7 +18,8 @@ import pytest
 from octasplat.workers.db.connections import Connection
 from octasplat.workers.db.migrate import migrate
 from octasplat.workers.postgres.embedded import EmbeddedPostgres
-from octasplat.workers.queue.jobs import NewJob, cancel_job, create_job
+from octasplat.workers.queue.block_jobs import cancel_job
+from octasplat.workers.queue.jobs import NewJob, create_job
 from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
 from tests.support import lock_order_check
 from tests.support.postgres_fixtures import copied_database

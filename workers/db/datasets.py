@@ -74,7 +74,7 @@ async def dataset_sizes(connection: Connection, ids: Sequence[uuid.UUID]) -> dic
             SELECT wanted.id,
                 (SELECT coalesce(sum(size_bytes), 0)::bigint FROM dataset_files WHERE dataset_id = wanted.id)
                     AS bytes,
-                (SELECT count(*) FROM jobs WHERE dataset_id = wanted.id) AS jobs
+                (SELECT count(*) FROM jobs WHERE dataset_id = wanted.id AND root_id IS NULL) AS jobs
             FROM unnest(%s::uuid[]) AS wanted(id)
             """,
             [list(ids)],

@@ -36,7 +36,7 @@ class Quota:
         max_bytes: files of datasets, results, and checkpoints of jobs that have not succeeded; content that
             occurs twice counts once.
         max_datasets: datasets.
-        max_jobs: jobs that are queued or running.
+        max_jobs: jobs that are queued or running; one in blocks is one.
         share: of the workers, where that of others is 1; see :mod:`octasplat.workers.queue.fair_share`.
     """
 
@@ -97,7 +97,7 @@ async def usage_of(connection: Connection, owner: str) -> Usage:
                 (SELECT coalesce(sum(bytes), 0)::bigint FROM owner_usage WHERE owner = %(owner)s) AS bytes,
                 (SELECT count(*) FROM datasets WHERE owner = %(owner)s) AS datasets,
                 (SELECT count(*) FROM jobs WHERE owner = %(owner)s
-                 AND state IN ('queued', 'running', 'canceling')) AS jobs
+                 AND root_id IS NULL AND state IN ('queued', 'running', 'canceling')) AS jobs
             """,
             {"owner": owner},
         )
@@ -185,7 +185,8 @@ async def check_new_job(connection: Connection, owner: str, default: Quota = NO_
         return
     query = """
         SELECT count(*) AS n FROM (
-            SELECT 1 FROM jobs WHERE owner = %s AND state IN ('queued', 'running', 'canceling') LIMIT %s
+            SELECT 1 FROM jobs
+            WHERE owner = %s AND root_id IS NULL AND state IN ('queued', 'running', 'canceling') LIMIT %s
         ) AS found
         """
     if await _query_number(connection, query, [owner, quota.max_jobs]) >= quota.max_jobs:

@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, Literal
 
+from octasplat.workers.db.errors import ConflictError
+
 JobState = Literal["queued", "running", "canceling", "succeeded", "failed", "canceled"]
 DatasetState = Literal["open", "checking", "committed"]
 DatasetHolds = Literal["photographs", "files"]
@@ -113,6 +115,8 @@ class Job:
             its turn.
         view_notes: what people wrote at places of the 3D view: ``text``, ``position``, ``camera``.
         begun_anew: why an attempt did not go on from the checkpoint that there was.
+        root_id: the job of which it does a part; such jobs are in no list, and no quota counts them.
+        role: ``root`` of a job in blocks, ``block`` of its parts; None for any other.
     """
 
     id: uuid.UUID
@@ -156,11 +160,27 @@ class Job:
     begun_anew: str | None = None
     requested: dict[str, Any] | None = None
     view_notes: list[dict[str, Any]] = field(default_factory=list)
+    root_id: uuid.UUID | None = None
+    role: str | None = None
 
     @property
     def is_over(self) -> bool:
         """Return whether the job is in a terminal state."""
         return self.state in TERMINAL
+
+    @property
+    def waits_for_blocks(self) -> bool:
+        """Return whether the job is under way, but only its blocks are with workers."""
+        return self.role == "root" and self.state in ("running", "canceling") and self.heartbeat_at is None
+
+    def refuse_block(self) -> None:
+        """Refuse to change a job that is a part of another.
+
+        Raises:
+            ConflictError: it is.
+        """
+        if self.root_id is not None:
+            raise ConflictError(f"The job is a block of the job {self.root_id}; change that one.")
 
 
 @dataclass(frozen=True)

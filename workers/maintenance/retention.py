@@ -88,7 +88,7 @@ async def update_expiry_times(connection: Connection, retention: Retention) -> N
                 SELECT jobs.id, coalesce(special.hours, %(hours)s::float8) AS hours FROM jobs
                 LEFT JOIN unnest(%(kinds)s::text[], %(kind_hours)s::float8[]) AS special (kind, hours)
                     ON special.kind = jobs.kind
-                WHERE jobs.expires_at IS NULL AND NOT jobs.pinned
+                WHERE jobs.expires_at IS NULL AND NOT jobs.pinned AND jobs.root_id IS NULL
                   AND jobs.state IN ('succeeded', 'failed', 'canceled')
             ) AS kept
             WHERE kept.id = jobs.id AND kept.hours > 0

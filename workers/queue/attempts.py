@@ -17,6 +17,13 @@ from octasplat.workers.db.locks import lock_owner
 from octasplat.workers.db.postgres_text import as_json, storable_text
 from octasplat.workers.db.quotas import NO_QUOTA, Quota, check_bytes
 from octasplat.workers.db.rows import TERMINAL, Job
+from octasplat.workers.queue.block_jobs import (
+    ROOT,
+    NewBlock,
+    forget_block_results,
+    release_needs,
+    start_blocks,
+)
 from octasplat.workers.queue.job_endings import MAX_RECOVERIES, end_job, recover_attempt
 from octasplat.workers.queue.jobs import get_job, requeue_job
 from octasplat.workers.queue.protocol import JobQueue
@@ -159,12 +166,19 @@ class Attempt:
                 [storable_text(self.redact(reason)), job.id],
             )
 
-    async def succeed(self, results: Sequence[ResultFile], psnr: float | None = None) -> None:
-        """Publish the results and end the job.
+    async def succeed(
+        self,
+        results: Sequence[ResultFile],
+        psnr: float | None = None,
+        *,
+        job_queue: JobQueue | None = None,
+    ) -> None:
+        """Publish the results and end the job; what waited for it is queued.
 
         Args:
             results: all of them.
             psnr: mean over the held-out views, dB, if they were measured.
+            job_queue: the queue; None leaves what waited for the job to the recovery.
 
         Raises:
             QuotaExceededError: the job's owner may not store as much.
@@ -174,7 +188,49 @@ class Attempt:
                 await connection.execute("UPDATE jobs SET psnr = %s WHERE id = %s", [psnr, job.id])
             await _replace_artifacts(connection, job, results)
             await end_job(connection, job, "succeeded", None)
+            if job.role == ROOT:
+                await forget_block_results(connection, job)
             await check_bytes(connection, job.owner, self.quota)
+            await release_needs(connection, job_queue, job)
+
+    async def start_blocks(
+        self,
+        job_queue: JobQueue,
+        checkpoint: Mapping[str, Any],
+        kind: str,
+        blocks: Sequence[NewBlock],
+        lease: StorageLease,
+        *,
+        first_steps: int,
+        total_steps: int,
+    ) -> None:
+        """Queue the blocks of the job, which ends the attempt; a job being cancelled ends instead.
+
+        Args:
+            job_queue: the queue.
+            checkpoint: manifest of the stored one, which the blocks begin with.
+            kind: of the blocks' jobs.
+            blocks: all of them.
+            lease: under which the checkpoint was stored.
+            first_steps: see :func:`octasplat.workers.queue.block_jobs.start_blocks`.
+            total_steps: likewise.
+
+        Raises:
+            StorageUnavailableError: ``lease`` was given up.
+            QuotaExceededError: the job's owner may not store as much.
+        """
+        contents = {file["sha256"] for file in checkpoint["files"]}
+        async with self._fenced_transaction(lease, contents, changes_usage=True) as (connection, job):
+            if job.state == "canceling":
+                await end_job(connection, job, "canceled", None)
+                return
+            await connection.execute(
+                "UPDATE jobs SET checkpoint = %s WHERE id = %s", [as_json(dict(checkpoint)), job.id]
+            )
+            await check_bytes(connection, job.owner, self.quota)
+            await start_blocks(
+                connection, job_queue, job, kind, blocks, first_steps=first_steps, total_steps=total_steps
+            )
 
     async def fail(
         self,
@@ -312,7 +368,8 @@ class Attempt:
             yield connection, job
 
     def _check_fence(self, job: Job | None) -> None:
-        if job is None or job.attempt != self.job.attempt or job.state not in ("running", "canceling"):
+        is_ours = job is not None and job.attempt == self.job.attempt and job.heartbeat_at is not None
+        if job is None or not is_ours or job.state not in ("running", "canceling"):
             raise FencedError(f"attempt {self.job.attempt} of job {self.job.id} is over")
 
 

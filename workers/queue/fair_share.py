@@ -2,7 +2,8 @@
 
 The owner with the fewest running jobs goes first, and among these the one whose turn was longest ago. Jobs of
 one owner go by priority, and where it is the same in their order. An owner to whom an administrator gave a
-share other than 1 counts as if so many owners had its jobs.
+share other than 1 counts as if so many owners had its jobs. The blocks of a job count by the workers that they
+hold, while the job that waits for them holds none: else an owner with one such job would have all workers.
 
 A choice takes a look at the index for each owner that waits, however many jobs they have queued.
 """
@@ -31,7 +32,8 @@ _FAIR_ORDER = """
         ) FROM owners WHERE owners.owner IS NOT NULL
     ), busy AS (
         SELECT owner, count(*) AS n FROM jobs
-        WHERE state IN ('running', 'canceling') AND queue = %(queue)s GROUP BY owner
+        WHERE state IN ('running', 'canceling') AND queue = %(queue)s AND heartbeat_at IS NOT NULL
+        GROUP BY owner
     )
     SELECT candidates.id FROM owners
     CROSS JOIN LATERAL (

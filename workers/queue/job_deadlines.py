@@ -22,8 +22,8 @@ async def seconds_spent(connection: Connection, job: Job) -> float:
         SELECT coalesce(sum(extract(epoch FROM ended.at - began.at)), 0)::float8 AS seconds
         FROM job_events began CROSS JOIN LATERAL (
             SELECT min(at) AS at FROM job_events
-            WHERE job_id = began.job_id AND id > began.id AND kind = 'state'
-              AND data->>'state' NOT IN ('running', 'canceling')
+            WHERE job_id = began.job_id AND id > began.id AND (kind = 'blocks_queued'
+              OR kind = 'state' AND data->>'state' NOT IN ('running', 'canceling'))
         ) ended
         WHERE began.job_id = %s AND began.kind = 'state' AND began.data->>'state' = 'running'
           AND began.attempt < %s AND began.id > coalesce((

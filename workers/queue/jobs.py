@@ -1,4 +1,4 @@
-"""Changes of jobs by users: created, listed, cancelled, retried, deleted.
+"""Changes of jobs by users: created, listed, retried, deleted.
 
 Every function takes a connection and works in one transaction of its own or of the caller's.
 """
@@ -25,6 +25,7 @@ _MATCHING: LiteralString = """
       AND (%(kind)s::text IS NULL OR kind = %(kind)s)
       AND (%(label)s::text IS NULL OR label = %(label)s)
       AND (%(dataset)s::uuid IS NULL OR dataset_id = %(dataset)s)
+      AND root_id IS NULL
       AND (%(text)s::text IS NULL OR strpos(lower(coalesce(label, '')), lower(%(text)s)) > 0
            OR strpos(kind, lower(%(text)s)) > 0 OR right(id::text, length(%(text)s)) = lower(%(text)s)
            OR EXISTS (SELECT FROM datasets AS d WHERE d.id = jobs.dataset_id
@@ -75,6 +76,8 @@ class NewJob:
     estimate: Mapping[str, Any] | None = None
     files_id: uuid.UUID | None = None
     requested: Mapping[str, Any] | None = None
+    root_id: uuid.UUID | None = None
+    role: str | None = None
 
 
 @dataclass(frozen=True)
@@ -102,13 +105,14 @@ async def create_job(connection: Connection, job_queue: JobQueue, new: NewJob) -
         await connection.execute(
             """
             INSERT INTO jobs (id, owner, kind, dataset_id, source_id, label, options, queue, priority, slip,
-                              traceparent, estimate, files_id, requested)
-            VALUES (%s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s)
+                              traceparent, estimate, files_id, requested, root_id, role)
+            VALUES (%s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s)
             """,
             [
                 job_id, new.owner, new.kind, new.dataset_id, new.source_id, new.label,
                 as_json(dict(new.options)), new.queue, new.priority, entry_id, new.traceparent,
                 as_json_or_null(new.estimate), new.files_id, as_json_or_null(new.requested),
+                new.root_id, new.role,
             ],
         )  # fmt: skip
         # What a new job uses is not about to expire any more.
@@ -200,30 +204,6 @@ async def queue_position(connection: Connection, job: Job) -> int | None:
     return int(row["ahead"]) if row else 0
 
 
-async def cancel_job(connection: Connection, job_queue: JobQueue, job_id: uuid.UUID) -> Job:
-    """Cancel a job: at once while it is queued, by its worker when it runs; may be repeated.
-
-    Raises:
-        ConflictError: it succeeded or failed already.
-        NotFoundError: there is no such job.
-    """
-    async with connection.transaction():
-        job = await _get_job_or_raise(connection, job_id, lock=True)
-        if job.state in ("succeeded", "failed"):
-            raise ConflictError(f"The job is over ({job.state}), so it cannot be cancelled.")
-        if job.state == "queued":
-            if job.slip is not None:
-                await job_queue.remove(connection, job.slip)
-            await connection.execute(
-                "UPDATE jobs SET state = 'canceled', finished_at = now(), slip = NULL WHERE id = %s", [job_id]
-            )
-            await add_event(connection, job_id, job.attempt, "state", {"state": "canceled"})
-        elif job.state == "running":
-            await connection.execute("UPDATE jobs SET state = 'canceling' WHERE id = %s", [job_id])
-            await add_event(connection, job_id, job.attempt, "state", {"state": "canceling"})
-        return await _get_job_or_raise(connection, job_id)
-
-
 async def retry_job(
     connection: Connection,
     job_queue: JobQueue,
@@ -242,13 +222,14 @@ async def retry_job(
         revised: options in the place of the job's own.
 
     Raises:
-        ConflictError: it is neither failed nor cancelled.
+        ConflictError: it is neither failed nor cancelled, or is a block of another.
         NotFoundError: there is no such job.
     """
     async with connection.transaction():
         # The owner's lock comes before the row's, see workers.db.locks.
         await lock_owner(connection, (await _get_job_or_raise(connection, job_id)).owner)
         job = await _get_job_or_raise(connection, job_id, lock=True)
+        job.refuse_block()
         if job.state not in ("failed", "canceled"):
             raise ConflictError(f"Only failed and canceled jobs are retried; this one is {job.state}.")
         await connection.execute(
@@ -270,6 +251,8 @@ async def retry_job(
         )
         if revised is not None:
             await _revise_options(connection, job_id, revised)
+        if from_start:
+            await connection.execute("DELETE FROM jobs WHERE root_id = %s", [job_id])
         await requeue_job(connection, job_queue, job)
         return await _get_job_or_raise(connection, job_id)
 
@@ -373,12 +356,13 @@ async def delete_job(connection: Connection, job_id: uuid.UUID) -> None:
     """Delete a finished job; its blobs stay until they are collected.
 
     Raises:
-        ConflictError: it is not over, or other jobs work on its results.
+        ConflictError: it is not over, other jobs work on its results, or it is a block of another.
         NotFoundError: there is no such job.
     """
     async with connection.transaction():
         await lock_owner(connection, (await _get_job_or_raise(connection, job_id)).owner)
         job = await _get_job_or_raise(connection, job_id, lock=True)
+        job.refuse_block()
         if not job.is_over:
             raise ConflictError(f"The job is {job.state}; cancel it first.")
         cursor = await connection.execute(

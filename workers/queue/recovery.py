@@ -11,6 +11,7 @@ from psycopg.rows import class_row
 from octasplat.workers.db.connections import Pool, select_columns
 from octasplat.workers.db.locks import about_to_lock_jobs, try_lock_recovery
 from octasplat.workers.db.rows import Job
+from octasplat.workers.queue.block_jobs import settle_root, unsettled_roots
 from octasplat.workers.queue.job_endings import recover_attempt
 from octasplat.workers.queue.jobs import get_job, requeue_job
 from octasplat.workers.queue.protocol import JobQueue
@@ -102,4 +103,6 @@ async def recover_stalled_jobs(
                 if again is not None and again.state == "queued":
                     logger.warning("job %s had no entry in the queue and got a new one", job_id)
                     await requeue_job(connection, job_queue, again)
+        for root_id in await unsettled_roots(connection):
+            await settle_root(connection, job_queue, root_id)
     return len(lost)

@@ -5,12 +5,16 @@ from octasplat.workers.queue.protocol import QueueDepth
 
 
 async def queue_depths(connection: Connection, owner: str | None = None) -> list[QueueDepth]:
-    """Return the count of an owner's waiting jobs in each queue that has some; None counts all owners'."""
+    """Return the count of an owner's waiting jobs in each queue that has some.
+
+    None counts all owners', for those who look after workers: blocks by themselves, as each takes a worker.
+    """
     cursor = await connection.execute(
         """
         SELECT queue, count(*) AS waiting,
             extract(epoch FROM now() - min(queued_at))::float8 AS oldest_seconds
-        FROM jobs WHERE state = 'queued' AND (%(owner)s::text IS NULL OR owner = %(owner)s)
+        FROM jobs WHERE state = 'queued'
+          AND (%(owner)s::text IS NULL OR owner = %(owner)s AND root_id IS NULL)
         GROUP BY queue ORDER BY queue
         """,
         {"owner": owner},
@@ -19,11 +23,12 @@ async def queue_depths(connection: Connection, owner: str | None = None) -> list
 
 
 async def running_by_queue(connection: Connection, owner: str | None = None) -> dict[str, int]:
-    """Return the number of an owner's running jobs by queue; None counts all owners'."""
+    """Return the number of an owner's running jobs by queue; None counts what all owners' workers do."""
     cursor = await connection.execute(
         """
         SELECT queue, count(*) AS n FROM jobs WHERE state IN ('running', 'canceling')
-          AND (%(owner)s::text IS NULL OR owner = %(owner)s) GROUP BY queue
+          AND (%(owner)s::text IS NULL AND heartbeat_at IS NOT NULL OR owner = %(owner)s AND root_id IS NULL)
+        GROUP BY queue
         """,
         {"owner": owner},
     )
@@ -48,6 +53,7 @@ async def worked_seconds(connection: Connection, owner: str) -> float:
         SELECT coalesce(sum(extract(epoch FROM coalesce(finished_at, now()) - started_at)), 0)::float8
             AS seconds
         FROM jobs WHERE owner = %s AND started_at IS NOT NULL AND state <> 'queued'
+          AND (finished_at IS NOT NULL OR heartbeat_at IS NOT NULL)
         """,
         [owner],
     )

@@ -1,0 +1,281 @@
+"""Jobs in blocks: a root that is seen, and children that train its blocks, each a row and an entry of its own.
+
+The root plans the blocks and then waits, running without a heartbeat. ``job_needs`` says for what; whichever
+child succeeds last puts it back into the queue, and its last attempt makes the results of theirs. All that
+ends children goes on by :func:`settle_root`, which may be called at any time and is repeated with the
+recovery of lost jobs, so that nothing depends on the process that should have called it.
+
+Rows are locked in the order of the children's ids, and the root's after them.
+"""
+
+import uuid
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from octasplat.workers.db.connections import Connection, fetch_all
+from octasplat.workers.db.errors import ConflictError, NotFoundError
+from octasplat.workers.db.events_and_logs import add_event
+from octasplat.workers.db.locks import about_to_lock_jobs
+from octasplat.workers.db.postgres_text import as_json
+from octasplat.workers.db.rows import Job
+from octasplat.workers.queue.job_endings import end_job
+from octasplat.workers.queue.jobs import NewJob, create_job, get_job, requeue_job
+from octasplat.workers.queue.protocol import JobQueue
+from octasplat.workers.storage.trees import TreeFile
+
+ROOT, BLOCK = "root", "block"
+"""Roles of jobs in blocks; other jobs have none."""
+RUN_PREFIX = "run"
+"""Folder of an attempt in which the results of blocks belong where they were made."""
+
+
+@dataclass(frozen=True)
+class NewBlock:
+    """A block to be trained by a job of its own.
+
+    Attributes:
+        number: of the block, from 1.
+        iterations: which tell how long it takes, beside others.
+        options: of its job; what a job with the same options has made is kept.
+    """
+
+    number: int
+    iterations: int
+    options: Mapping[str, Any]
+
+
+async def start_blocks(
+    connection: Connection,
+    job_queue: JobQueue,
+    root: Job,
+    kind: str,
+    blocks: Sequence[NewBlock],
+    *,
+    first_steps: int,
+    total_steps: int,
+) -> None:
+    """Queue the blocks of a job, which waits for them from now on; the caller holds the job's lock.
+
+    Blocks that an earlier attempt has queued are kept if their options are the same: those that succeeded
+    are not trained again.
+
+    Args:
+        connection: of the transaction.
+        job_queue: the queue.
+        root: the job.
+        kind: of the blocks' jobs.
+        blocks: all of them.
+        first_steps: iterations before the blocks, which are done.
+        total_steps: iterations of the whole job.
+    """
+    kept: dict[int, Job] = {}
+    wanted = {block.number: dict(block.options) for block in blocks}
+    for child in await blocks_of(connection, [root.id]):
+        if child.options == wanted.get(number := int(child.options["number"])):
+            kept[number] = child
+        else:
+            await connection.execute("DELETE FROM jobs WHERE id = %s", [child.id])
+    # The longest first, so that none is left over in the end.
+    for block in sorted(blocks, key=lambda block: (-block.iterations, block.number)):
+        child = kept.get(block.number)
+        if child is None:
+            child = await create_job(connection, job_queue, _job_of_block(root, kind, block))
+        elif child.state == "succeeded":
+            continue
+        elif child.is_over:
+            await connection.execute(
+                """
+                UPDATE jobs SET rescues = 0, error = NULL, finished_at = NULL, stage = NULL, step = NULL,
+                    total_steps = NULL WHERE id = %s
+                """,
+                [child.id],
+            )
+            await requeue_job(connection, job_queue, child)
+        await connection.execute(
+            "INSERT INTO job_needs (job_id, needs_id) VALUES (%s, %s) ON CONFLICT DO NOTHING",
+            [root.id, child.id],
+        )
+    await connection.execute(
+        """
+        UPDATE jobs SET role = %s, heartbeat_at = NULL, worker = NULL, seconds_left = NULL, rescues = 0,
+            stage = 'train', step = %s, total_steps = %s
+        WHERE id = %s
+        """,
+        [ROOT, first_steps, total_steps, root.id],
+    )
+    data = {"blocks": len(blocks), "done": sum(child.state == "succeeded" for child in kept.values())}
+    await add_event(connection, root.id, root.attempt, "blocks_queued", data)
+
+
+async def release_needs(connection: Connection, job_queue: JobQueue, child: Job) -> None:
+    """Queue the jobs that need nothing more now that a child has succeeded; called in that transaction."""
+    cursor = await connection.execute(
+        "DELETE FROM job_needs WHERE needs_id = %s RETURNING job_id", [child.id]
+    )
+    for row in await cursor.fetchall():
+        root = await get_job(connection, row["job_id"], lock=True)
+        if root is None or not root.waits_for_blocks:
+            continue
+        left = await _count_needs(connection, root.id)
+        data = {"block": int(child.options["number"]), "left": left}
+        await add_event(connection, root.id, root.attempt, "block_finished", data)
+        if root.state == "running" and not left:
+            await requeue_job(connection, job_queue, root)
+
+
+async def settle_root(connection: Connection, job_queue: JobQueue, root_id: uuid.UUID) -> None:
+    """Bring a job that waits for its blocks to where these are; does nothing to any other.
+
+    A block that failed ends the others and then the job; where the job is being canceled, so are its blocks.
+    """
+    async with connection.transaction():
+        children = await _lock_blocks(connection, root_id)
+        root = await get_job(connection, root_id, lock=True)
+        if root is None or not root.waits_for_blocks:
+            return
+        ended = [child for child in children if child.state in ("failed", "canceled")]
+        if root.state == "running" and ended:
+            root = await _give_up(connection, root, ended, len(children))
+        if root.state == "running":
+            if not await _count_needs(connection, root.id):
+                await requeue_job(connection, job_queue, root)
+            return
+        for child in children:
+            await _cancel(connection, job_queue, child)
+        if all(child.is_over or child.state == "queued" for child in children):
+            await end_job(connection, root, "canceled" if root.error is None else "failed", root.error)
+
+
+async def unsettled_roots(connection: Connection) -> list[uuid.UUID]:
+    """Return the jobs that wait for blocks and may have to go on, or to end."""
+    cursor = await connection.execute(
+        """
+        SELECT id FROM jobs AS root
+        WHERE state IN ('running', 'canceling') AND heartbeat_at IS NULL AND role = %s AND (
+            state = 'canceling' OR NOT EXISTS (SELECT FROM job_needs WHERE job_id = root.id)
+            OR EXISTS (SELECT FROM jobs WHERE root_id = root.id AND state IN ('failed', 'canceled')))
+        ORDER BY id
+        """,
+        [ROOT],
+    )
+    return [row["id"] for row in await cursor.fetchall()]
+
+
+async def blocks_of(connection: Connection, roots: Sequence[uuid.UUID]) -> list[Job]:
+    """Return the jobs of the blocks of some jobs, by number."""
+    query = "SELECT {} FROM jobs WHERE root_id = ANY(%s) ORDER BY root_id, (options->>'number')::int"
+    return await fetch_all(connection, Job, query, [list(roots)]) if roots else []
+
+
+async def files_from_others(connection: Connection, job: Job) -> list[TreeFile]:
+    """Return what a job in blocks takes over from others, by the places in the folder of its attempt.
+
+    A block takes what the root had when it planned them, and the root what its blocks have made.
+    """
+    if job.root_id is not None:
+        root = await get_job(connection, job.root_id)
+        files = ((root.checkpoint if root is not None else None) or {}).get("files", ())
+        return [TreeFile.model_validate(file) for file in files]
+    cursor = await connection.execute(
+        """
+        SELECT name, sha256, size_bytes FROM artifacts JOIN jobs ON jobs.id = artifacts.job_id
+        WHERE jobs.root_id = %s AND jobs.state = 'succeeded' ORDER BY name
+        """,
+        [job.id],
+    )
+    return [
+        TreeFile(path=f"{RUN_PREFIX}/{row['name']}", sha256=row["sha256"], size_bytes=row["size_bytes"])
+        for row in await cursor.fetchall()
+    ]
+
+
+async def forget_block_results(connection: Connection, root: Job) -> None:
+    """Remove what the blocks of a job have made, which is in its own results now."""
+    await connection.execute(
+        "DELETE FROM artifacts WHERE job_id IN (SELECT id FROM jobs WHERE root_id = %s)", [root.id]
+    )
+
+
+async def cancel_job(connection: Connection, job_queue: JobQueue, job_id: uuid.UUID) -> Job:
+    """Cancel a job: at once while it is queued, by its worker when it runs; may be repeated.
+
+    Raises:
+        ConflictError: it succeeded or failed already, or is a block of another.
+        NotFoundError: there is no such job.
+    """
+    async with connection.transaction():
+        await _lock_blocks(connection, job_id)
+        job = await get_job(connection, job_id, lock=True)
+        if job is None:
+            raise NotFoundError("job")
+        job.refuse_block()
+        if job.state in ("succeeded", "failed"):
+            raise ConflictError(f"The job is over ({job.state}), so it cannot be cancelled.")
+        await _cancel(connection, job_queue, job)
+        await settle_root(connection, job_queue, job_id)
+        canceled = await get_job(connection, job_id)
+        assert canceled is not None
+        return canceled
+
+
+async def _cancel(connection: Connection, job_queue: JobQueue, job: Job) -> None:
+    """Cancel a job that is not over; the caller holds its lock."""
+    if job.state == "queued":
+        if job.slip is not None:
+            await job_queue.remove(connection, job.slip)
+        await connection.execute(
+            "UPDATE jobs SET state = 'canceled', finished_at = now(), slip = NULL WHERE id = %s", [job.id]
+        )
+        await add_event(connection, job.id, job.attempt, "state", {"state": "canceled"})
+    elif job.state == "running":
+        await connection.execute("UPDATE jobs SET state = 'canceling' WHERE id = %s", [job.id])
+        await add_event(connection, job.id, job.attempt, "state", {"state": "canceling"})
+
+
+async def _give_up(connection: Connection, root: Job, ended: Sequence[Job], count: int) -> Job:
+    """Begin to end a job of which blocks have ended without success; return it as it is then."""
+    failed = [child for child in ended if child.state == "failed"]
+    error = None
+    if failed:
+        first = min(failed, key=lambda child: (child.finished_at is None, child.finished_at, child.id))
+        number, reason = int(first.options["number"]), first.error or {}
+        message = (
+            f"Block {number} of {count} failed: {reason.get('message', '')} What others have made is kept."
+        )
+        error = {"type": reason.get("type", "block_failed"), "message": message, "block": number}
+    await connection.execute(
+        "UPDATE jobs SET state = 'canceling', error = %s WHERE id = %s",
+        [None if error is None else as_json(error), root.id],
+    )
+    await add_event(connection, root.id, root.attempt, "state", {"state": "canceling"})
+    return replace(root, state="canceling", error=error)
+
+
+async def _lock_blocks(connection: Connection, root_id: uuid.UUID) -> list[Job]:
+    await about_to_lock_jobs(connection)
+    query = "SELECT {} FROM jobs WHERE root_id = %s ORDER BY id FOR UPDATE"
+    return await fetch_all(connection, Job, query, [root_id])
+
+
+async def _count_needs(connection: Connection, job_id: uuid.UUID) -> int:
+    cursor = await connection.execute("SELECT count(*) AS n FROM job_needs WHERE job_id = %s", [job_id])
+    row = await cursor.fetchone()
+    assert row is not None
+    return int(row["n"])
+
+
+def _job_of_block(root: Job, kind: str, block: NewBlock) -> NewJob:
+    return NewJob(
+        owner=root.owner,
+        kind=kind,
+        options=block.options,
+        queue=root.queue,
+        priority=root.priority,
+        dataset_id=root.dataset_id,
+        label=f"block {block.number}",
+        traceparent=root.traceparent,
+        estimate=root.estimate,
+        root_id=root.id,
+        role=BLOCK,
+    )
