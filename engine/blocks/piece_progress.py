@@ -2,7 +2,13 @@
 
 from dataclasses import replace
 
-from octasplat.engine.core.events import Event, EventListener, HeldOutMeasured, TrainingProgress
+from octasplat.engine.core.events import (
+    CheckpointWritten,
+    Event,
+    EventListener,
+    HeldOutMeasured,
+    TrainingProgress,
+)
 
 
 class PieceProgress:
@@ -35,16 +41,22 @@ class PieceProgress:
                 return  # of the coarse scene alone, at another size
             if isinstance(event, TrainingProgress):
                 event = self._translate(name, event)
+            elif isinstance(event, CheckpointWritten):
+                event = replace(event, iteration=self._iterations_before(name) + event.iteration)
             self._progress(event)
 
         return listen
+
+    def _iterations_before(self, name: str) -> int:
+        names = list(self._iterations)
+        return sum(self._iterations[other] for other in names[: names.index(name)])
 
     def _translate(self, name: str, event: TrainingProgress) -> TrainingProgress:
         """Return the progress of a piece as that of all."""
         names = list(self._iterations)
         place = names.index(name)
         counts = list(self._iterations.values())
-        before, after = sum(counts[:place]), sum(counts[place + 1 :])
+        before, after = self._iterations_before(name), sum(counts[place + 1 :])
         left_here = event.total_iterations - event.iteration
         pace_s = event.seconds_left / left_here if left_here else event.seconds / max(event.iteration, 1)
         if self._last[0] != name:

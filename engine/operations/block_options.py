@@ -9,6 +9,7 @@ from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.base import Options
 from octasplat.engine.settings.fields import Spelling
+from octasplat.engine.settings.refusals import InvalidSettingsError, Refusal
 
 if TYPE_CHECKING:
     from octasplat.engine.pipeline import BlockRequest
@@ -33,6 +34,28 @@ class BlockOptions(Options):
     )
 
 
+def check_block_options(options: BlockOptions, config: "ReconstructionConfig") -> None:
+    """Refuse options of blocks that can be told to be wrong before the photographs are known.
+
+    Raises:
+        InvalidSettingsError: the memory is given without blocks or is no size, or the settings go with one
+            training only.
+    """
+    from octasplat.engine.blocks.piece_settings import require_blocks_possible
+
+    name = "memory"
+    try:
+        if options.memory is not None:
+            parse_memory(options.memory)
+        if options.memory is not None and options.blocks is None:
+            raise ConfigError("--memory is that of a block; say --blocks auto, too.")
+        name = "blocks"
+        if isinstance(options.blocks, int) and options.blocks > 1:  # an automatic number is known later
+            require_blocks_possible(config.train, has_time_budget=config.minutes is not None)
+    except ConfigError as error:
+        raise InvalidSettingsError([Refusal((name,), "blocks", str(error))]) from None
+
+
 def block_request(
     options: BlockOptions, config: "ReconstructionConfig", sizes: Sequence[ImageSizes]
 ) -> "BlockRequest | None":
@@ -49,9 +72,8 @@ def block_request(
     from octasplat.engine.operations.cost_model import gaussians_within
     from octasplat.engine.pipeline import BlockRequest
 
+    check_block_options(options, config)
     if options.blocks is None:
-        if options.memory is not None:
-            raise ConfigError("--memory is that of a block; say --blocks auto, too.")
         return None
     most = None
     if options.memory is not None:

@@ -144,6 +144,10 @@ class ReconstructOptions(RunSettings, Options):
         }
 
 
+class ReconstructJobOptions(ReconstructOptions, BlockOptions):
+    """Options of a reconstruction that is queued."""
+
+
 class ReconstructRequest(ReconstructOptions, BlockOptions, Request):
     """Reconstruct SCENE, a folder with images/ and a COLMAP model in sparse/0, or with photographs alone.
 
@@ -209,16 +213,16 @@ class ReconstructResult(Result):
         return self.summary
 
 
-def options_from_json(requested: Mapping[str, Any]) -> ReconstructOptions:
-    """Return options from JSON.
+def options_from_json(requested: Mapping[str, Any]) -> ReconstructJobOptions:
+    """Return the options of a queued reconstruction from JSON.
 
     Raises:
         InvalidSettingsError: an option is unknown or out of range.
     """
     try:
-        return ReconstructOptions.model_validate(dict(requested))
+        return ReconstructJobOptions.model_validate(dict(requested))
     except ValidationError as error:
-        raise InvalidSettingsError(refusals_from(error, ReconstructOptions)) from None
+        raise InvalidSettingsError(refusals_from(error, ReconstructJobOptions)) from None
 
 
 def run_config(request: ReconstructRequest) -> "ReconstructionConfig":

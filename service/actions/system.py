@@ -42,7 +42,8 @@ async def get_kind(service: Service, name: str) -> KindView:
         ProblemError: 404 if it does not exist or the principal may not see it.
     """
     try:
-        return await run_in_pool(ThreadPurpose.OPTIONS, _kind_view, get_job_kind(name), service)
+        kind = get_job_kind(name, is_asked_for=True)
+        return await run_in_pool(ThreadPurpose.OPTIONS, _kind_view, kind, service)
     except ConfigError:
         raise not_found_error("kind of job") from None
 

@@ -21,7 +21,7 @@ def validate_kind(name: str) -> JobKind:
         ProblemError: 422.
     """
     try:
-        return get_job_kind(name)
+        return get_job_kind(name, is_asked_for=True)
     except ConfigError as error:
         raise ProblemError(
             422, "kind", str(error), errors=[{"pointer": "#/kind", "detail": str(error)}]

@@ -1,4 +1,4 @@
-"""Jobs in blocks: a root that is seen, and children that train its blocks, each a row and an entry of its own.
+"""Jobs in blocks: a root, which is seen, and children, each of which trains a block as a job of its own.
 
 The root plans the blocks and then waits, running without a heartbeat. ``job_needs`` says for what; whichever
 child succeeds last puts it back into the queue, and its last attempt makes the results of theirs. All that
@@ -13,6 +13,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from octasplat.engine.core import versions
+from octasplat.engine.core.errors import CheckpointError
 from octasplat.workers.db.connections import Connection, fetch_all
 from octasplat.workers.db.errors import ConflictError, NotFoundError
 from octasplat.workers.db.events_and_logs import add_event
@@ -78,12 +80,12 @@ async def start_blocks(
             await connection.execute("DELETE FROM jobs WHERE id = %s", [child.id])
     # The longest first, so that none is left over in the end.
     for block in sorted(blocks, key=lambda block: (-block.iterations, block.number)):
-        child = kept.get(block.number)
-        if child is None:
+        known = kept.get(block.number)
+        if known is None:
             child = await create_job(connection, job_queue, _job_of_block(root, kind, block))
-        elif child.state == "succeeded":
+        elif known.state == "succeeded":
             continue
-        elif child.is_over:
+        elif (child := known).is_over:
             await connection.execute(
                 """
                 UPDATE jobs SET rescues = 0, error = NULL, finished_at = NULL, stage = NULL, step = NULL,
@@ -108,8 +110,11 @@ async def start_blocks(
     await add_event(connection, root.id, root.attempt, "blocks_queued", data)
 
 
-async def release_needs(connection: Connection, job_queue: JobQueue, child: Job) -> None:
-    """Queue the jobs that need nothing more now that a child has succeeded; called in that transaction."""
+async def release_needs(connection: Connection, job_queue: JobQueue | None, child: Job) -> None:
+    """Queue the jobs that need nothing more now that a child has succeeded; called in that transaction.
+
+    Without a queue they are left to :func:`settle_root`.
+    """
     cursor = await connection.execute(
         "DELETE FROM job_needs WHERE needs_id = %s RETURNING job_id", [child.id]
     )
@@ -120,7 +125,7 @@ async def release_needs(connection: Connection, job_queue: JobQueue, child: Job)
         left = await _count_needs(connection, root.id)
         data = {"block": int(child.options["number"]), "left": left}
         await add_event(connection, root.id, root.attempt, "block_finished", data)
-        if root.state == "running" and not left:
+        if job_queue is not None and root.state == "running" and not left:
             await requeue_job(connection, job_queue, root)
 
 
@@ -172,11 +177,19 @@ async def files_from_others(connection: Connection, job: Job) -> list[TreeFile]:
     """Return what a job in blocks takes over from others, by the places in the folder of its attempt.
 
     A block takes what the root had when it planned them, and the root what its blocks have made.
+
+    Raises:
+        CheckpointError: the blocks were planned by a version of other results.
     """
     if job.root_id is not None:
         root = await get_job(connection, job.root_id)
-        files = ((root.checkpoint if root is not None else None) or {}).get("files", ())
-        return [TreeFile.model_validate(file) for file in files]
+        checkpoint = (root.checkpoint if root is not None else None) or {}
+        if checkpoint.get("results", 1) != versions.RESULTS_VERSION:
+            raise CheckpointError(
+                "The blocks were planned by a version in which the same settings gave other results; retry "
+                "the job from the start."
+            )
+        return [TreeFile.model_validate(file) for file in checkpoint["files"]]
     cursor = await connection.execute(
         """
         SELECT name, sha256, size_bytes FROM artifacts JOIN jobs ON jobs.id = artifacts.job_id
@@ -241,7 +254,7 @@ async def _give_up(connection: Connection, root: Job, ended: Sequence[Job], coun
         first = min(failed, key=lambda child: (child.finished_at is None, child.finished_at, child.id))
         number, reason = int(first.options["number"]), first.error or {}
         message = (
-            f"Block {number} of {count} failed: {reason.get('message', '')} What others have made is kept."
+            f"Block {number} of {count} failed: {reason.get('message', '')} The others' results are kept."
         )
         error = {"type": reason.get("type", "block_failed"), "message": message, "block": number}
     await connection.execute(

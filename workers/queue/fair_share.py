@@ -2,8 +2,8 @@
 
 The owner with the fewest running jobs goes first, and among these the one whose turn was longest ago. Jobs of
 one owner go by priority, and where it is the same in their order. An owner to whom an administrator gave a
-share other than 1 counts as if so many owners had its jobs. The blocks of a job count by the workers that they
-hold, while the job that waits for them holds none: else an owner with one such job would have all workers.
+share other than 1 counts as if so many owners had its jobs. The blocks of a job count by the workers that
+they hold, while the job that waits for them holds none: else one such job could have all workers.
 
 A choice takes a look at the index for each owner that waits, however many jobs they have queued.
 """

@@ -23,7 +23,10 @@ from octasplat.workers.worker.job_kinds.stored_options import resolve_here
 
 def version_facts() -> dict[str, Any]:
     """Return the version facts that a worker publishes, to be matched with jobs."""
-    return {"kinds": [kind.name for kind in job_kinds()], "results": versions.RESULTS_VERSION}
+    return {
+        "kinds": [kind.name for kind in job_kinds(with_internal=True)],
+        "results": versions.RESULTS_VERSION,
+    }
 
 
 async def reason_incapable(pool: Pool, job_id: uuid.UUID, stale_seconds: float) -> str | None:
@@ -40,9 +43,12 @@ async def reason_incapable(pool: Pool, job_id: uuid.UUID, stale_seconds: float) 
             return None
         if (unknown := _unknown_to_version(job)) is not None:
             return unknown
-        if job.checkpoint is None or Checkpoint.from_row(job.checkpoint).results == versions.RESULTS_VERSION:
+        # What a block begins with is the checkpoint of the whole job.
+        whole = job if job.root_id is None else await get_job(connection, job.root_id)
+        checkpoint = None if whole is None else whole.checkpoint
+        if checkpoint is None or Checkpoint.from_row(checkpoint).results == versions.RESULTS_VERSION:
             return None
-        made_by = Checkpoint.from_row(job.checkpoint).results
+        made_by = Checkpoint.from_row(checkpoint).results
         # Left to a worker of that version only while one is alive; without any, the job begins anew here.
         for row in await live_workers(connection, stale_seconds):
             if job.queue in row.queues and row.facts.get("results", 1) == made_by:

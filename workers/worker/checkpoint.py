@@ -7,6 +7,8 @@ from typing import Any
 from octasplat.engine.core import versions
 from octasplat.workers.storage.trees import TreeFile
 
+_PLAN_FILES = ("run/blocks/plan.npz", "run/blocks/coarse/best.npz")
+
 
 @dataclass(frozen=True)
 class Checkpoint:
@@ -55,3 +57,9 @@ class Checkpoint:
         if other is None:
             return True
         return (order.get(self.stage, 0), self.step) > (order.get(other.stage, 0), other.step)
+
+
+def plan_digest(checkpoint: Checkpoint) -> str:
+    """Return what tells the plan of blocks in a checkpoint, with the coarse scene, from any other."""
+    files = {file.path: file.sha256 for file in checkpoint.files}
+    return "-".join(files.get(name, "") for name in _PLAN_FILES)

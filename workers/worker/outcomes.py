@@ -2,14 +2,16 @@
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 import psycopg
+from pydantic import BaseModel
 
 from octasplat.engine.core.errors import OctasplatError
 from octasplat.workers.db.quotas import QuotaExceededError
 from octasplat.workers.queue.attempts import Attempt, ResultFile
+from octasplat.workers.queue.block_jobs import NewBlock
 from octasplat.workers.queue.job_endings import MAX_RECOVERIES
 from octasplat.workers.queue.storage_leases import StorageLease, storage_lease
 from octasplat.workers.storage.disk_space import SpaceUsage
@@ -21,10 +23,12 @@ from octasplat.workers.storage.errors import (
     UntrustedFileError,
 )
 from octasplat.workers.storage.os_errors import is_disk_full
+from octasplat.workers.worker.checkpoint import plan_digest
 from octasplat.workers.worker.context import DatabaseLostError, WorkerContext
 from octasplat.workers.worker.heartbeat import DATABASE_ERRORS, Heartbeat
+from octasplat.workers.worker.job_kinds import JobKind
 from octasplat.workers.worker.reporter import Reporter
-from octasplat.workers.worker.task import NO_SPACE_ERROR
+from octasplat.workers.worker.task import NO_SPACE_ERROR, BlocksPlanned
 from octasplat.workers.worker.workspace import Workspace
 
 logger = logging.getLogger(__name__)
@@ -86,6 +90,23 @@ class OutcomeWriter:
             # The next attempt would take the manifest for results that were published but not recorded.
             await self._discard_published_results()
         # The machine did its work in either case: a quota is its owner's matter.
+        self._context.host_health.record_success()
+
+    async def start_blocks(self, planned: BlocksPlanned, kind: JobKind, options: Mapping[str, Any]) -> None:
+        """Store what the blocks begin with and queue them; the job waits for them.
+
+        Args:
+            planned: what the program has told.
+            kind: of the job.
+            options: complete ones of the job.
+        """
+        try:
+            await self._store_and_start_blocks(planned, kind, kind.options.model_validate(dict(options)))
+        except QuotaExceededError as error:
+            problem = {"type": "quota", "message": f"What its blocks begin with cannot be stored. {error}"}
+            await self._write_with_retries(lambda: self._attempt.fail(problem))
+        except StorageError as error:
+            await self.handle_error(error)
         self._context.host_health.record_success()
 
     async def fail(self, error: dict[str, Any]) -> None:
@@ -223,6 +244,34 @@ class OutcomeWriter:
             await asyncio.to_thread(self._workspace.withdraw_results)
         except StorageError as error:
             logger.warning("the results of job %s stay in the store: %s", self._job.id, error)
+
+    async def _store_and_start_blocks(
+        self, planned: BlocksPlanned, kind: JobKind, options: BaseModel
+    ) -> None:
+        first = planned.first_iterations
+        while True:
+            try:
+                async with storage_lease(self._attempt.pool, self._context.storage) as note:
+                    checkpoint = await asyncio.to_thread(self._workspace.store_checkpoint, "train", first)
+                    if checkpoint is None:
+                        raise StorageError("The plan of the blocks is not in the job's folder.")
+                    plan = plan_digest(checkpoint)
+                    blocks = [
+                        NewBlock(number, length, kind.options_of_block(options, number, plan))
+                        for number, length in zip(planned.numbers, planned.iterations, strict=True)
+                    ]
+                    await self._attempt.start_blocks(
+                        self._context.job_queue,
+                        checkpoint.as_row(),
+                        kind.block_kind,
+                        blocks,
+                        note,
+                        first_steps=first,
+                        total_steps=planned.total_iterations,
+                    )
+                    return
+            except DATABASE_ERRORS as error:
+                await self._pause_or_raise(error)
 
     async def _with_partial_results(
         self, write: Callable[[list[ResultFile], StorageLease], Awaitable[None]]

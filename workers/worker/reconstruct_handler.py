@@ -1,22 +1,33 @@
-"""Program of the jobs that reconstruct; only such a job's own process imports this."""
+"""Programs of the jobs that reconstruct; only such a job's own process imports this."""
 
 import shutil
 
+from octasplat.engine.blocks.scene_plan import block_name
 from octasplat.engine.core.compiling import report_compilation
 from octasplat.engine.core.errors import CheckpointError, ConfigError
 from octasplat.engine.core.events import Event, PhaseFinished, PhaseProgress, Warned, broadcast
 from octasplat.engine.core.progress import stop_when_asked
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.operations.block_options import block_request
+from octasplat.engine.operations.photograph_sizes import photograph_sizes
+from octasplat.engine.pipeline import (
+    BlockRequest,
+    PlanBlocks,
+    TrainBlock,
+    block_files,
+    missing_blocks,
+    planned_blocks,
+)
 from octasplat.engine.pipeline import reconstruct as reconstruct_scene
-from octasplat.engine.runs.config import ReconstructionConfig
-from octasplat.engine.runs.run_folder import CACHE, CHECKPOINTS, CONFIG, SCENE, found_model_folder
+from octasplat.engine.runs.run_folder import BLOCKS, CACHE, CHECKPOINTS, CONFIG, SCENE, found_model_folder
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.protocol import Tracer
+from octasplat.workers.worker.job_kinds.reconstruct_kinds import BlockJobConfig, ReconstructJobConfig
 from octasplat.workers.worker.live_scene import LiveSceneWriter
 from octasplat.workers.worker.preview import PreviewRenderer
 from octasplat.workers.worker.publishing import path_redactor, publish_file
-from octasplat.workers.worker.task import Task
+from octasplat.workers.worker.task import BlocksPlanned, Task
 
 _STAGES_OF_POSES = ("poses", "placing", "lenses", "load")
 
@@ -40,9 +51,64 @@ def reconstruct(task: Task) -> None:
         _run_reconstruction(task)
 
 
+def train_block(task: Task) -> None:
+    """Train a block of a run that another job has planned; what it comes to is the result."""
+    options = BlockJobConfig.model_validate(task.options)
+    own = task.run / BLOCKS / block_name(options.number)
+    has_left = own.exists()
+    try:
+        _run_step(task, options, TrainBlock(options.number))
+    except CheckpointError:
+        if not has_left:
+            raise
+        shutil.rmtree(own)  # an earlier attempt left what cannot be gone on with
+        _run_step(task, options, TrainBlock(options.number))
+    for path in block_files(task.run, options.number):
+        publish_file(task, path, path.relative_to(task.run).as_posix())
+
+
+def _plan_blocks(task: Task, options: ReconstructJobConfig, blocks: BlockRequest) -> bool:
+    """Plan the blocks of a run, if it has several; return whether they are to be trained by other jobs."""
+    if planned_blocks(task.run) is None:
+        _run_step(task, options, PlanBlocks(), blocks)
+    if (plan := planned_blocks(task.run)) is None or not missing_blocks(task.run, plan):
+        return False
+    lengths = {number: length for number, length in enumerate(plan.iterations, start=1) if length}
+    total = sum(plan.expected_iterations().values())
+    task.progress(BlocksPlanned(tuple(lengths), tuple(lengths.values()), plan.coarse_iterations, total))
+    return True
+
+
+def _run_step(
+    task: Task,
+    options: ReconstructJobConfig,
+    step: PlanBlocks | TrainBlock,
+    blocks: BlockRequest | None = None,
+) -> None:
+    """Run one step of a run after its photographs are open."""
+    assert task.scene is not None
+    with report_compilation(task.progress):
+        reconstruct_scene(
+            task.scene,
+            task.run,
+            options.run_config(),
+            resume=True,
+            threads=task.threads,
+            progress=stop_when_asked(task.progress, task.should_stop),
+            should_stop=task.should_stop,
+            blocks=blocks,
+            steps=(step,),
+        )
+
+
 def _run_reconstruction(task: Task) -> None:
     assert task.scene is not None
-    config = ReconstructionConfig.model_validate(task.options)
+    options = ReconstructJobConfig.model_validate(task.options)
+    config = options.run_config()
+    sizes = photograph_sizes(task.scene) if options.memory is not None else []
+    blocks = block_request(options, config, sizes)
+    if blocks is not None and blocks.count != 1 and _plan_blocks(task, options, blocks):
+        return
 
     preview = PreviewRenderer(task.run, config.evaluation_background, task.progress)
     live = LiveSceneWriter(task.run, task.progress)
@@ -78,6 +144,7 @@ def _run_reconstruction(task: Task) -> None:
                 ),
                 should_stop=task.should_stop,
                 on_step=show_step,
+                blocks=blocks,
             )
     finally:
         _publish_run(task)
@@ -91,5 +158,5 @@ def _publish_run(task: Task) -> None:
         name = path.relative_to(task.run)
         # Hidden files are previews and live scenes, which are stored on their own, or files being written.
         hidden = any(part.startswith(".") for part in name.parts)
-        if path.is_file() and not hidden and name.parts[0] not in (CHECKPOINTS, CACHE):
+        if path.is_file() and not hidden and name.parts[0] not in (BLOCKS, CHECKPOINTS, CACHE):
             publish_file(task, path, name.as_posix())

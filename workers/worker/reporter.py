@@ -25,7 +25,7 @@ from octasplat.workers.reporting.events import decode_event, encode_training_pro
 from octasplat.workers.reporting.time_left import TimeLeftEstimator, work_of_stage
 from octasplat.workers.storage.errors import StorageError
 from octasplat.workers.worker.checkpoint import Checkpoint
-from octasplat.workers.worker.task import RUN_FOLDER
+from octasplat.workers.worker.task import RUN_FOLDER, BlocksPlanned, read_planned_blocks
 from octasplat.workers.worker.workspace import Workspace
 
 logger = logging.getLogger(__name__)
@@ -69,6 +69,8 @@ class Reporter:
         self._live_scene: dict[str, Any] | None = None
         self._checkpoint: Checkpoint | None = None
         self._stores_checkpoints = True
+        self.blocks_planned: BlocksPlanned | None = None
+        """The blocks that the program has planned, if it ended with that."""
         self._wake = asyncio.Event()
         self._flushing = asyncio.Lock()
         self._tasks = [asyncio.create_task(self._flush_forever()), asyncio.create_task(self._store_forever())]
@@ -140,6 +142,8 @@ class Reporter:
                 self._events.append(("progress", self._progress.pop("event")))
             if event["stage"] in ("poses", "placing", "lenses", "train"):
                 self._want_checkpoint(self._steps if event["stage"] == "train" else 0)
+        elif kind == BlocksPlanned.kind:
+            self.blocks_planned = read_planned_blocks(event)
         elif kind == "preview_written":
             self._preview = event
             self._wake.set()

@@ -19,6 +19,7 @@ from octasplat.engine.operations.precompile import request_groups
 from octasplat.workers.cancellation import cancel_and_wait
 from octasplat.workers.db.datasets import files_of, get_dataset
 from octasplat.workers.queue.attempts import Attempt, FencedError
+from octasplat.workers.queue.block_jobs import files_from_others
 from octasplat.workers.queue.job_deadlines import seconds_spent
 from octasplat.workers.queue.job_endings import MAX_SILENT_RECOVERIES
 from octasplat.workers.queue.jobs import artifacts_of
@@ -161,7 +162,11 @@ class Supervisor:
             await self._reporter.finish()
         # A program that was done before it heard of the wish to stop has succeeded.
         if code == 0 and self._stop_reason in (None, StopReason.CANCELED, StopReason.DRAINING):
-            await self._outcomes.publish()
+            planned = self._reporter.blocks_planned
+            if planned is not None and kind.block_kind:
+                await self._outcomes.start_blocks(planned, kind, task["options"])
+            else:
+                await self._outcomes.publish()
         elif self._stop_reason is not None:
             await self._after_stop(self._stop_reason)
         elif self._child.is_ready:
@@ -184,12 +189,14 @@ class Supervisor:
             dataset = await get_dataset(connection, job.dataset_id) if job.dataset_id else None
             files = await files_of(connection, job.dataset_id) if job.dataset_id else []
             artifacts = await artifacts_of(connection, job.source_id) if job.source_id else []
+            others = await files_from_others(connection, job) if job.role is not None else []
             named = await files_of(connection, job.files_id) if job.files_id else []
             # The limit is for all attempts of the job together.
             left = 3600 * settings.max_job_hours - await seconds_spent(connection, job)
         self._deadline_at = time.monotonic() + left
         checkpoint = None if job.checkpoint is None else Checkpoint.from_row(job.checkpoint)
         copied = sum(a.size_bytes for a in artifacts if a.name in kind.source_files)
+        copied += sum(file.size_bytes for file in others)
         if checkpoint is not None:
             fetched = self._workspace.stored_frames.fetched(checkpoint.files)
             copied += sum(file.size_bytes for file in fetched)
@@ -201,8 +208,10 @@ class Supervisor:
             await asyncio.to_thread(self._workspace.fetch_source, artifacts, kind.source_files)
         if named:
             await asyncio.to_thread(self._workspace.fetch_files, named)
-        if checkpoint is not None:
-            await self._restore(checkpoint)
+        is_restored = checkpoint is not None and await self._restore(checkpoint)
+        # What blocks have made goes with the plan that is in the checkpoint.
+        if others and (job.root_id is not None or is_restored):
+            await asyncio.to_thread(self._workspace.fetch_from_others, others)
         self._reporter.set_stages(kind.stages(options))
         await compile_for_job(
             request_groups(kind.name, options),
@@ -226,22 +235,24 @@ class Supervisor:
             "memory_limit_bytes": self._context.memory_limit_bytes,
         }
 
-    async def _restore(self, checkpoint: Checkpoint) -> None:
+    async def _restore(self, checkpoint: Checkpoint) -> bool:
+        """Restore a checkpoint; return False where it cannot be used, so that the job begins anew."""
         if checkpoint.results != versions.RESULTS_VERSION:
             await self._tell_begun_anew(
                 "the checkpoint is of a version in which the same settings gave other results, so the job "
                 "begins anew."
             )
-            return
+            return False
         try:
             await asyncio.to_thread(self._workspace.restore, checkpoint)
         except (BlobNotFoundError, DigestMismatchError) as error:
             await asyncio.to_thread(self._workspace.discard_run)
             await self._tell_begun_anew(f"the checkpoint cannot be used, so the job begins anew: {error}")
-            return
+            return False
         self._reporter.record_resume(checkpoint)
         data = {"stage": checkpoint.stage, "step": checkpoint.step, "attempt": checkpoint.attempt}
         await self._attempt.add_event("resumed", data)
+        return True
 
     async def _tell_begun_anew(self, why: str) -> None:
         self._reporter.add_note(f"Warning: {why}")

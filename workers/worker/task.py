@@ -3,9 +3,9 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
-from octasplat.engine.core.events import EventListener, ignore_events
+from octasplat.engine.core.events import Event, EventListener, ignore_events
 
 RUN_FOLDER, RESULTS_FOLDER, FILES_FOLDER = "run", "results", "files"
 """Folders of an attempt: the engine's output, what is to be published, files that are named."""
@@ -24,12 +24,46 @@ INFO_FILE = "info.json"
 
 NO_SPACE_ERROR = "no_space"
 """Type of the error of a job that met a full disk, which is no fault of its own."""
+MAX_BLOCKS = 10_000
+"""As many as may be asked for."""
 EXIT_REFUSED = 1
 """The job cannot be done and another try would end the same way; the last line says why."""
 EXIT_UNEXPECTED = 70
 """A fault of the program."""
 EXIT_STOPPED = 75
 """Stopped as asked; what is needed to go on is in the folder."""
+
+
+@dataclass(frozen=True)
+class BlocksPlanned(Event):
+    """A job has planned its blocks and ends; it is begun again when these are trained.
+
+    Attributes:
+        numbers: of the blocks to be trained by jobs of their own.
+        iterations: of each.
+        first_iterations: those before the blocks, which are done.
+        total_iterations: of the whole job.
+    """
+
+    kind: ClassVar[str] = "blocks_planned"
+    numbers: tuple[int, ...]
+    iterations: tuple[int, ...]
+    first_iterations: int
+    total_iterations: int
+
+
+def read_planned_blocks(event: Mapping[str, Any]) -> BlocksPlanned | None:
+    """Return the blocks that a program says it has planned; None where what it says is no plan."""
+    try:
+        numbers, iterations = ([int(n) for n in event[name]] for name in ("numbers", "iterations"))
+        first, total = int(event["first_iterations"]), int(event["total_iterations"])
+    except (KeyError, TypeError, ValueError, OverflowError):
+        return None
+    is_plausible = 0 < len(numbers) == len(set(numbers)) == len(iterations) <= MAX_BLOCKS
+    amounts = (first, total, *numbers, *iterations)
+    if not is_plausible or not all(0 <= amount < 2**31 for amount in amounts):
+        return None
+    return BlocksPlanned(tuple(numbers), tuple(iterations), first, total)
 
 
 @dataclass(frozen=True)

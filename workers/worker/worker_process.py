@@ -34,7 +34,8 @@ from octasplat.workers.maintenance.garbage_collection import collect_garbage
 from octasplat.workers.maintenance.retention import apply_retention, thin_progress_events
 from octasplat.workers.maintenance.webhooks.sender import WebhookSender
 from octasplat.workers.parent_death_signal import die_with_local_service
-from octasplat.workers.queue.attempts import FencedError, claim
+from octasplat.workers.queue.attempts import Attempt, FencedError, claim
+from octasplat.workers.queue.block_jobs import settle_root
 from octasplat.workers.queue.fair_share import choose_job
 from octasplat.workers.queue.job_deadlines import fail_abandoned_jobs
 from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
@@ -280,6 +281,16 @@ class _Worker:
         attempt = await claim(self._pool, job_id, entry_id, self._name)
         if attempt is None:
             return
+        await self._attempt_job(attempt, since)
+        if attempt.job.root_id is not None:
+            # Else the recovery does it a little later.
+            with contextlib.suppress(*DATABASE_ERRORS):
+                async with self._pool.connection() as connection:
+                    await settle_root(connection, self._context.job_queue, attempt.job.root_id)
+
+    async def _attempt_job(self, attempt: Attempt, since: float) -> None:
+        """Run an attempt, which was asked for at ``since`` by ``time.monotonic()``."""
+        job_id = attempt.job.id
         try:
             await Supervisor(attempt, self._context, since).run()
         except DatabaseLostError as error:

@@ -8,7 +8,7 @@ import re
 import shutil
 import time
 import uuid
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO
 
@@ -41,8 +41,11 @@ POSES_FOLDER = "poses"
 _CHECKPOINT = re.compile(r"run/checkpoints/iteration_\d+\.npz")
 _CHECKPOINT_FILES = (
     "run/config.json", "run/held_out.json", "run/views.json", "run/events.jsonl", "run/training.json",
-    "run/plan.json", "run/scene.ply", "run/checkpoints/best.npz",
+    "run/plan.json", "run/georeference.json", "run/scene.ply", "run/checkpoints/best.npz",
 )  # fmt: skip
+_BLOCKS_FOLDER = "run/blocks"
+_BLOCK = re.compile(r"block_\d+")
+"""The pieces of which each has a job of its own."""
 _MAX_TRIES = 5
 METRICS_FILE = "metrics.json"
 MAX_METRICS_BYTES = 16 << 20
@@ -67,6 +70,7 @@ class Workspace:
         self._dataset_lock: IO[bytes] | None = None
         self._dataset: Path | None = None
         self.stored_frames = StoredFrames(self.folder, are_removed=removes_stored_frames(job))
+        self._own_block = f"block_{job.options['number']:03d}" if job.role == "block" else None
         self._peak_used_bytes = 0
 
     def open(self) -> None:
@@ -183,6 +187,14 @@ class Workspace:
         files = self.stored_frames.adopt(checkpoint.files, self.storage)
         fetch_tree(self.storage, files, self.folder, writable=True)
 
+    def fetch_from_others(self, files: Sequence[TreeFile]) -> None:
+        """Fetch what other jobs have made for this one, by its place in the folder.
+
+        Raises:
+            StorageError: some of it is gone or damaged.
+        """
+        fetch_tree(self.storage, files, self.folder, writable=True)
+
     def discard_run(self) -> None:
         """Discard what was restored."""
         remove_folder(self.folder / RUN_FOLDER)
@@ -269,13 +281,35 @@ class Workspace:
             names = [name for name in _CHECKPOINT_FILES if folder.is_file(name)]
             poses = sorted(_directly_below(folder, f"{RUN_FOLDER}/{POSES_FOLDER}"))
             checkpoints = _directly_below(folder, f"{RUN_FOLDER}/checkpoints")
-        names += poses
+            pieces = list(_piece_files(folder, self._own_block))
+        if self._own_block is not None:  # all else is the whole job's
+            return pieces
+        names += [*poses, *pieces]
         if "run/scene.ply" in names:  # the training is done, its checkpoints are of no more use
             return [name for name in names if not name.endswith(".npz")]
         newest = max((name for name in checkpoints if _CHECKPOINT.fullmatch(name)), default=None)
         if newest is not None:
             return [*names, newest]
-        return names if poses else []
+        return names if poses or pieces else []
+
+
+def _piece_files(folder: UntrustedFolder, own_block: str | None) -> Iterator[str]:
+    """Yield the files of a run in blocks from which an attempt goes on, the newest checkpoint of each piece.
+
+    Args:
+        folder: of the attempt.
+        own_block: the block of its job; None for the whole, which goes without those of its blocks.
+    """
+    newest: dict[str, str] = {}
+    for name in sorted(folder.names(_BLOCKS_FOLDER)):
+        piece, _, rest = name.partition("/")
+        if (piece != own_block) if own_block is not None else _BLOCK.fullmatch(piece):
+            continue
+        if not rest or rest in ("best.npz", "piece.json"):
+            yield f"{_BLOCKS_FOLDER}/{name}"
+        elif re.fullmatch(r"checkpoints/(iteration_\d+|best)\.npz", rest):
+            newest[f"{piece}/{'best' if rest.endswith('best.npz') else 'iteration'}"] = name
+    yield from (f"{_BLOCKS_FOLDER}/{name}" for name in newest.values())
 
 
 def _directly_below(folder: UntrustedFolder, below: str) -> list[str]:

@@ -11,7 +11,8 @@ from urllib.parse import urlsplit
 import click
 
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.operations.reconstruct import ReconstructOptions
+from octasplat.engine.operations.block_options import check_block_options
+from octasplat.engine.operations.reconstruct import ReconstructJobOptions
 from octasplat.engine.settings.renamed_settings import notify_renamed
 from octasplat.workers.cli.options import exports_option, parse_export_names
 from octasplat.workers.cli.printing import Printer, output_options
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     help="Where SCENE is an address: what the ZIP file must be; then it is fetched once only.",
 )
 @wait_options
-@request_options(ReconstructOptions)
+@request_options(ReconstructJobOptions)
 @job_options
 @output_options
 def submit(
@@ -61,8 +62,8 @@ def submit(
     from octasplat.workers.client.submission import Submission
 
     _check_output(output, wait=wait)
-    options: ReconstructOptions = request_from_options(ReconstructOptions, given)
-    options.config()  # what cannot be used is refused before anything is sent
+    options: ReconstructJobOptions = request_from_options(ReconstructJobOptions, given)
+    check_block_options(options, options.config())  # what cannot be used is refused before anything is sent
     requested = options.model_dump(mode="json", exclude_unset=True)
     what = Submission(scene, requested, label, queue, priority, sha256)
     with connected(server, awaits_start=True) as api:

@@ -48,6 +48,10 @@ class JobKind(Generic[OptionsT]):
     """Whether what is made stands where the photographs of the source job show it."""
     export_option = ""
     """Where the options name the files of :meth:`exported_files`."""
+    is_internal = False
+    """Whether only other jobs queue it, so that nobody can ask for it."""
+    block_kind = ""
+    """The kind of the jobs that train its blocks, if its program may plan some; see ``BlocksPlanned``."""
 
     def __init__(
         self,
@@ -127,6 +131,16 @@ class JobKind(Generic[OptionsT]):
         """Return the files that the options name, each after the place where they do, with dots."""
         return ()
 
+    def options_of_block(self, options: OptionsT, number: int, plan: str) -> dict[str, Any]:
+        """Return the options of the job of a block, as JSON values.
+
+        Args:
+            options: of the whole job.
+            number: of the block, from 1.
+            plan: digests of what the block begins with.
+        """
+        raise NotImplementedError
+
     def estimate(self, options: OptionsT, sizes: Sequence[ImageSizes], cores: int) -> "Estimate | None":
         """Return the time and memory on so many cores; None where it is unknown."""
         return None
@@ -153,22 +167,31 @@ def register(kind: JobKind[Any]) -> JobKind[Any]:
     return kind
 
 
-def job_kinds() -> tuple[JobKind[Any], ...]:
-    """Return all kinds: the built-in ones, then others in the order in which they were registered."""
+def job_kinds(*, with_internal: bool = False) -> tuple[JobKind[Any], ...]:
+    """Return all kinds: the built-in ones, then others in the order in which they were registered.
+
+    Args:
+        with_internal: those, too, that nobody can ask for.
+    """
     builtin = _builtin_kinds()
     for name in builtin.keys() & _KINDS.keys():
         raise ValueError(f"a job kind named '{name}' is built in already")
-    return (*builtin.values(), *_KINDS.values())
+    kinds = (*builtin.values(), *_KINDS.values())
+    return tuple(kind for kind in kinds if with_internal or not kind.is_internal)
 
 
-def get_job_kind(name: str) -> JobKind[Any]:
+def get_job_kind(name: str, *, is_asked_for: bool = False) -> JobKind[Any]:
     """Return the kind of that name.
+
+    Args:
+        name: of the kind.
+        is_asked_for: whether somebody asks for it, who may have no internal one.
 
     Raises:
         ConfigError: there is none.
     """
     kind = _KINDS.get(name) or _builtin_kinds().get(name)
-    if kind is None:
+    if kind is None or (is_asked_for and kind.is_internal):
         names = ", ".join(known.name for known in job_kinds())
         raise ConfigError(f"There is no job kind '{name}'; choose one of {names}.")
     return kind

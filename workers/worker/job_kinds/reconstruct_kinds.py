@@ -1,0 +1,163 @@
+"""Kinds of jobs that reconstruct a scene: the whole of it, and one of its blocks."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pydantic import Field
+
+from octasplat.engine.dataset.image_sizes import ImageSizes
+from octasplat.engine.operations.block_options import BlockOptions, check_block_options
+from octasplat.engine.operations.cost_model import (
+    Estimate,
+    estimate_reconstruction,
+    reconstruction_bytes,
+    training_pixels,
+)
+from octasplat.engine.operations.reconstruct import OPERATION as RECONSTRUCT
+from octasplat.engine.operations.reconstruct import ReconstructJobOptions, options_from_json
+from octasplat.engine.runs.config import ReconstructionConfig, revise_requested
+from octasplat.engine.train.config import MAX_PLANNED_ITERATIONS, iteration_count, max_gaussian_count
+from octasplat.workers.worker.job_kinds.operation_kind import OperationKind
+from octasplat.workers.worker.job_kinds.registry import JobKind
+from octasplat.workers.worker.job_kinds.resource_limits import ResourceDemand
+
+BLOCK_KIND = "reconstruct_block"
+_PROGRAMS = "octasplat.workers.worker.reconstruct_handler"
+
+
+class ReconstructJobConfig(ReconstructionConfig, BlockOptions):
+    """All settings of a job that reconstructs; those of blocks are not among the settings of its run."""
+
+    def run_config(self) -> ReconstructionConfig:
+        """Return the settings of the run."""
+        return ReconstructionConfig.model_validate(self.model_dump(include=_RUN_FIELDS))
+
+
+class BlockJobConfig(ReconstructJobConfig):
+    """Settings of a job that trains a block: those of the job in blocks, and which block."""
+
+    number: int = Field(ge=1)
+    plan: str = Field(description="Digests of what the block begins with, so that no other is taken for it.")
+
+
+_RUN_FIELDS = set(ReconstructionConfig.model_fields)
+
+
+class ReconstructKind(OperationKind):
+    """Kind of jobs that reconstruct a scene from photographs."""
+
+    export_option = "exports"
+    block_kind = BLOCK_KIND
+
+    def __init__(self) -> None:
+        super().__init__(
+            RECONSTRUCT,
+            title="Photographs to a scene, its meshes and measurements",
+            stages=(),
+            needs="dataset",
+            options=ReconstructJobOptions,
+            complete_options=ReconstructJobConfig,
+            program=f"{_PROGRAMS}:reconstruct",
+            reports_stages=True,
+        )
+
+    def resolve(self, values: Mapping[str, Any]) -> ReconstructJobConfig:
+        """Return complete options: those of the preset, overridden by the given ones."""
+        options = options_from_json(values)
+        return _with_blocks(options.config(), options.blocks, options.memory)
+
+    def revise(self, options: Mapping[str, Any], changes: Mapping[str, Any]) -> ReconstructJobConfig:
+        """Return the options of a job with changes; another preset brings its own settings."""
+        given = options_from_json(changes)
+        blocks = {name: options.get(name) for name in BlockOptions.model_fields}
+        blocks |= {name: getattr(given, name) for name in blocks if name in given.model_fields_set}
+        run = {name: value for name, value in options.items() if name not in blocks}
+        return _with_blocks(given.revised(run), **blocks)
+
+    def as_requested(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the given settings, those of the training by their places below ``train``."""
+        options = options_from_json(values)
+        blocks = {
+            name: getattr(options, name)
+            for name in BlockOptions.model_fields
+            if name in options.model_fields_set
+        }
+        return {**options.requested(), **blocks}
+
+    def revise_requested(self, requested: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the given settings with changes; another preset brings its own settings."""
+        return revise_requested(requested, changes)
+
+    def stages(self, options: ReconstructJobConfig) -> tuple[str, ...]:
+        """Return the stages, those that find poses among them if there are none."""
+        stages = ("load", "train", "evaluate", "export")
+        return stages if options.poses == "given" else ("features", "matches", "poses", *stages)
+
+    def needs_poses(self, options: ReconstructJobConfig) -> bool:
+        """Return whether the dataset must hold a COLMAP model."""
+        return options.poses == "given"
+
+    def with_poses_known(self, options: ReconstructJobConfig, has_poses: bool) -> ReconstructionConfig:
+        """Return the options with poses decided, so that no job shows stages that it will not have."""
+        return options.with_poses_decided(has_poses)
+
+    def is_resumable_with(self, old: ReconstructJobConfig, new: ReconstructJobConfig) -> bool:
+        """Return whether only the files differ, which are written after everything else."""
+        return old.model_copy(update={"exports": new.exports}) == new
+
+    def exported_files(self, options: ReconstructJobConfig) -> tuple[str, ...]:
+        """Return the names of the files to export."""
+        return options.exports
+
+    def options_of_block(self, options: ReconstructJobConfig, number: int, plan: str) -> dict[str, Any]:
+        """Return the options of a block's job; files are exported by the whole job only."""
+        return {**options.model_dump(mode="json"), "exports": [], "number": number, "plan": plan}
+
+    def resource_demands(
+        self, options: ReconstructJobConfig, sizes: Sequence[ImageSizes]
+    ) -> tuple[ResourceDemand, ...]:
+        """Return the resource demands of the training."""
+        train = options.train
+        pixels = training_pixels(options, sizes)
+        gaussians = max_gaussian_count(train, pixels)
+        # With a limit of time the count is not known before; the most that may be planned is demanded.
+        iterations = MAX_PLANNED_ITERATIONS if options.minutes else iteration_count(train, pixels)
+        return (
+            ResourceDemand("train.iterations", "iterations", iterations),
+            ResourceDemand("train.max_gaussians", "gaussians", gaussians),
+            ResourceDemand("train.rays_per_batch", "rays", train.rays_per_batch),
+            ResourceDemand("train.probe_rays", "rays", train.probe_rays),
+            ResourceDemand("train.ray_patch_rays", "rays", train.ray_patch_rays),
+            ResourceDemand("train.ssim_patch_side", "rays", train.ssim_patch_side**2),
+            ResourceDemand("max_side", "side_px", options.max_side or 0),
+            ResourceDemand("exports", "exports", len(options.exports)),
+            ResourceDemand("max_side", "workspace_bytes", reconstruction_bytes(options, sizes)),
+        )
+
+    def estimate(self, options: ReconstructJobConfig, sizes: Sequence[ImageSizes], cores: int) -> Estimate:
+        """Return the time and memory that it takes, as a whole even if in blocks."""
+        return estimate_reconstruction(options, sizes, cores)
+
+
+class BlockKind(JobKind[BlockJobConfig]):
+    """Kind of jobs that train one block; only a job in blocks queues them."""
+
+    is_internal = True
+
+    def __init__(self) -> None:
+        super().__init__(
+            name=BLOCK_KIND,
+            title="One block of a scene",
+            needs="dataset",
+            options=BlockJobConfig,
+            program=f"{_PROGRAMS}:train_block",
+            stages=("load", "train"),
+        )
+
+
+def _with_blocks(
+    config: ReconstructionConfig, blocks: Any = None, memory: str | None = None
+) -> ReconstructJobConfig:
+    check_block_options(BlockOptions(blocks=blocks, memory=memory), config)
+    given = config.model_dump(mode="json")
+    return ReconstructJobConfig.model_validate({**given, "blocks": blocks, "memory": memory})
