@@ -12,6 +12,7 @@ from octasplat.engine.core.errors import ConfigError
 from octasplat.service.actions.access import fetch_visible_job
 from octasplat.service.actions.pages import Page, page_of
 from octasplat.service.auth import Principal
+from octasplat.service.block_progress import with_block_progress
 from octasplat.service.idempotency import create_once, fingerprint
 from octasplat.service.job_limits import limit_notes
 from octasplat.service.problems import ProblemError
@@ -22,13 +23,14 @@ from octasplat.service.queue_workers import (
     paused_queue_note,
     queued_job_notes,
 )
-from octasplat.service.schemas.jobs import JobChange, JobView
+from octasplat.service.schemas.jobs import BlockView, JobChange, JobView
 from octasplat.service.state import Service
 from octasplat.workers.db.connections import Connection, retry_on_deadlock
 from octasplat.workers.db.holds import read_holds
 from octasplat.workers.db.postgres_text import storable_text
 from octasplat.workers.db.rows import Job, JobState
 from octasplat.workers.queue import jobs as rows
+from octasplat.workers.queue.block_jobs import ROOT, blocks_of
 from octasplat.workers.queue.block_jobs import cancel_job as cancel_job_row
 from octasplat.workers.queue.jobs import JobOrder
 from octasplat.workers.queue.usage_figures import running_by_queue
@@ -94,6 +96,11 @@ async def list_jobs(
             order=job_filter.order,
             limit=limit + 1,
         )
+        waiting = [job.id for job in found if job.waits_for_blocks]
+        blocks = await blocks_of(connection, waiting)
+    found = [
+        with_block_progress(job, [block for block in blocks if block.root_id == job.id]) for job in found
+    ]
     return page_of(found, limit, lambda job: job.id)
 
 
@@ -235,13 +242,15 @@ async def job_view(connection: Connection, service: Service, principal: Principa
                 notes += drained_workers_note(workers, holds.workers, job.queue)
             if not notes:
                 notes += busy_workers_note(workers, await running_by_queue(connection), job.queue)
-    return JobView.from_row(
-        replace(job, options=complete_options(job)),
+    blocks = await blocks_of(connection, [job.id]) if job.role == ROOT else []
+    view = JobView.from_row(
+        replace(with_block_progress(job, blocks), options=complete_options(job)),
         stages_of(job),
         await rows.queue_position(connection, job),
         notes,
         shows_worker=principal.may("admin"),
     )
+    return view.model_copy(update={"blocks": [BlockView.from_row(block) for block in blocks]})
 
 
 def _searchable_text(text: str | None) -> str | None:

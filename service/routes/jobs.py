@@ -148,8 +148,11 @@ async def delete_job(
 
 def _job_etag(job: JobWithView) -> str:
     view = job.view
-    # The version of the row counts neither other jobs of the queue nor what the notes say of workers.
+    # The version of the row counts neither other jobs, as those of its blocks, nor what notes say of workers.
     place = "" if view.queue_position is None else f".{view.queue_position}"
+    if view.blocks and not job.row.is_over:
+        blocks = json.dumps([block.model_dump(mode="json") for block in view.blocks])
+        place += f".{hashlib.sha256(blocks.encode()).hexdigest()[:16]}"
     if view.notes:
         place += f".{hashlib.sha256(json.dumps(view.notes).encode()).hexdigest()[:16]}"
     return f'"{job.row.version}{place}"'

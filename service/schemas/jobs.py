@@ -196,6 +196,27 @@ class JobSummary(BaseModel):
         )
 
 
+class BlockView(BaseModel):
+    """A block of a job that trains its scene in blocks."""
+
+    number: int = Field(description="From 1.")
+    name: str
+    id: uuid.UUID = Field(description="Of the job that trains it, which is in no list; its log tells more.")
+    state: JobState
+    attempt: int
+    step: int | None
+    total_steps: int | None
+    seconds_left: float | None
+    error: JobError | None
+
+    @classmethod
+    def from_row(cls, row: Job) -> Self:
+        """Return the view of the row of a block's job."""
+        number = int(row.options["number"])
+        names = ("id", "state", "attempt", "step", "total_steps", "seconds_left", "error")
+        return cls(number=number, name=f"block {number}", **{name: getattr(row, name) for name in names})
+
+
 class JobView(JobSummary):
     """A job."""
 
@@ -252,6 +273,9 @@ class JobView(JobSummary):
     )
 
     view_notes: list[ViewNote] = Field([], description="What people wrote at places of the 3D view.")
+    blocks: list[BlockView] = Field(
+        [], description="Of a scene that is trained in blocks, once they are planned; a job each trains them."
+    )
     options: dict[str, Any] = Field(
         description="Every setting: as resolved where the job ran, or as this version would resolve it."
     )

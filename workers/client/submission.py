@@ -212,6 +212,8 @@ def wait_for_job(
         note = {
             "rescued": "The worker was lost; another one goes on.",
             "handed_back": "The worker stops; another one goes on.",
+            "blocks_queued": f"The scene is trained in {event.get('blocks')} blocks.",
+            "block_finished": f"Block {event.get('block')} is trained, {event.get('left')} to go.",
             "resumed": f"Going on from step {event.get('step')} of {event.get('stage')}.",
         }.get(event["kind"])
         if note is not None:

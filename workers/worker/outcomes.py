@@ -257,7 +257,7 @@ class OutcomeWriter:
                         raise StorageError("The plan of the blocks is not in the job's folder.")
                     plan = plan_digest(checkpoint)
                     blocks = [
-                        NewBlock(number, length, kind.options_of_block(options, number, plan))
+                        NewBlock(number, length, kind.options_of_block(options, number, length, plan))
                         for number, length in zip(planned.numbers, planned.iterations, strict=True)
                     ]
                     await self._attempt.start_blocks(

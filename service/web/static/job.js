@@ -98,7 +98,7 @@ async function readPast() {
     }
 }
 
-const KINDS = ["progress", "preview", "state", "stage_started", "stage_finished", "held_out_measured", "warning", "live_scene", "checkpoint", "rescued", "handed_back", "resumed", "stages", "run_finished"];
+const KINDS = ["progress", "preview", "state", "stage_started", "stage_finished", "held_out_measured", "warning", "live_scene", "checkpoint", "rescued", "handed_back", "resumed", "stages", "blocks_queued", "block_finished", "run_finished"];
 
 function listen() {
     let failures = 0;

@@ -37,6 +37,7 @@ class BlockJobConfig(ReconstructJobConfig):
     """Settings of a job that trains a block: those of the job in blocks, and which block."""
 
     number: int = Field(ge=1)
+    iterations: int = Field(ge=0, description="Of its training, as far as known.")
     plan: str = Field(description="Digests of what the block begins with, so that no other is taken for it.")
 
 
@@ -109,9 +110,12 @@ class ReconstructKind(OperationKind):
         """Return the names of the files to export."""
         return options.exports
 
-    def options_of_block(self, options: ReconstructJobConfig, number: int, plan: str) -> dict[str, Any]:
+    def options_of_block(
+        self, options: ReconstructJobConfig, number: int, iterations: int, plan: str
+    ) -> dict[str, Any]:
         """Return the options of a block's job; files are exported by the whole job only."""
-        return {**options.model_dump(mode="json"), "exports": [], "number": number, "plan": plan}
+        own = {"exports": [], "number": number, "iterations": iterations, "plan": plan}
+        return {**options.model_dump(mode="json"), **own}
 
     def resource_demands(
         self, options: ReconstructJobConfig, sizes: Sequence[ImageSizes]

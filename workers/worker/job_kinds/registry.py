@@ -131,12 +131,13 @@ class JobKind(Generic[OptionsT]):
         """Return the files that the options name, each after the place where they do, with dots."""
         return ()
 
-    def options_of_block(self, options: OptionsT, number: int, plan: str) -> dict[str, Any]:
+    def options_of_block(self, options: OptionsT, number: int, iterations: int, plan: str) -> dict[str, Any]:
         """Return the options of the job of a block, as JSON values.
 
         Args:
             options: of the whole job.
             number: of the block, from 1.
+            iterations: of its training.
             plan: digests of what the block begins with.
         """
         raise NotImplementedError

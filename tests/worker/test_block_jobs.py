@@ -1,0 +1,148 @@
+"""Jobs in blocks: one job for its owner, whatever becomes of the workers that train its blocks."""
+
+import signal
+import uuid
+from typing import Any
+
+import psycopg
+import pytest
+
+from octasplat.workers.db.errors import ConflictError
+from octasplat.workers.db.quotas import usage_of
+from octasplat.workers.db.rows import Job
+from octasplat.workers.queue.block_jobs import blocks_of
+from octasplat.workers.queue.jobs import delete_job, list_jobs
+from tests.support.worker_harness import WorkerHarness
+
+KINDS = {"KIND_MODULES": '["tests.support.toy_kind", "tests.support.block_toys"]'}
+SOON = {"STALE_SECONDS": "3", **KINDS}
+DONE = b"1:11 2:12 3:13"
+
+
+def blocks(bench: WorkerHarness, root: uuid.UUID) -> list[Job]:
+    found: list[Job] = bench.run_query(lambda c: blocks_of(c, [root]))
+    return found
+
+
+def states(bench: WorkerHarness, root: uuid.UUID) -> list[str]:
+    return [job.state for job in blocks(bench, root)]
+
+
+def submit(bench: WorkerHarness, **options: Any) -> uuid.UUID:
+    return bench.submit("block_toy", options={"gate": str(bench.gate), **options})
+
+
+def rows(bench: WorkerHarness, table: str) -> int:
+    with psycopg.connect(bench.conninfo) as connection:
+        found = connection.execute(f"SELECT count(*) FROM {table}".encode()).fetchone()
+    assert found is not None
+    return int(found[0])
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_blocks_are_trained_by_all_workers_and_one_job_is_seen(bench: WorkerHarness, workers: int) -> None:
+    for number in range(workers):
+        bench.worker(name=f"w{number}", **KINDS)
+    root = submit(bench)
+    job = bench.wait_until_finished(root)
+    assert (job.state, job.error, job.role, job.attempt) == ("succeeded", None, "root", 2)
+    assert bench.results(root) == {"sum.txt": DONE}
+    children = blocks(bench, root)
+    assert [child.options["number"] for child in children] == [1, 2, 3]
+    assert {child.state for child in children} == {"succeeded"}
+    assert [job.id for job in bench.run_query(list_jobs)] == [root]
+    # What the blocks have made is in the results of the whole, and theirs is not kept.
+    assert all(bench.results(child.id) == {} for child in children) and rows(bench, "job_needs") == 0
+    kinds = [event.kind for event in bench.events(root)]
+    assert kinds.count("blocks_queued") == 1 and kinds.count("block_finished") == 3
+    with pytest.raises(ConflictError, match="is a block of the job"):
+        bench.run_query(lambda c: delete_job(c, children[0].id))
+    with pytest.raises(ConflictError, match="is a block of the job"):
+        bench.cancel(children[0].id)
+    bench.run_query(lambda c: delete_job(c, root))
+    assert rows(bench, "jobs") == 0
+
+
+def test_worker_killed_during_a_block_is_replaced(bench: WorkerHarness) -> None:
+    first = bench.worker(name="first", **SOON)
+    root = submit(bench, hold=1)
+    # The longest block goes first.
+    bench.wait(
+        root, lambda _: [(child.checkpoint or {}).get("step") for child in blocks(bench, root)][-1:] == [5]
+    )
+    waiting = bench.job(root)
+    assert (waiting.state, waiting.heartbeat_at, waiting.worker) == ("running", None, None)
+    assert bench.run_query(lambda c: usage_of(c, "me")).jobs == 1
+    bench.worker(name="second", **SOON)
+    bench.wait_until_up("second")
+    first.send_signal(signal.SIGKILL)
+    bench.wait(root, lambda _: any(child.worker == "second" for child in blocks(bench, root)))
+    bench.open_gate()
+    job = bench.wait_until_finished(root)
+    assert job.state == "succeeded" and bench.results(root) == {"sum.txt": DONE}
+    children = blocks(bench, root)
+    assert children[2].attempt == 2 and all(child.attempt == 1 for child in children[:2])
+    resumed = [event for event in bench.events(children[2].id) if event.kind == "resumed"]
+    assert [event.data["step"] for event in resumed] == [5]
+
+
+def test_failed_block_fails_the_whole_and_a_retry_keeps_what_succeeded(bench: WorkerHarness) -> None:
+    bench.worker(**KINDS)
+    root = submit(bench, refuse=2)
+    job = bench.wait_until_finished(root)
+    assert job.state == "failed" and job.error is not None
+    assert job.error["type"] == "dataset_error" and job.error["block"] == 2
+    assert job.error["message"].startswith("Block 2 of 3 failed: The toy refuses this block.")
+    assert states(bench, root) == ["canceled", "failed", "succeeded"]  # the longest first
+    bench.open_gate()
+    assert bench.retry(root).state == "queued"
+    assert bench.wait_until_finished(root).state == "succeeded"
+    assert bench.results(root) == {"sum.txt": DONE}
+    assert [child.attempt for child in blocks(bench, root)] == [1, 2, 1]
+
+
+def test_cancelling_ends_all_blocks_and_a_retry_goes_on(bench: WorkerHarness) -> None:
+    bench.worker(**KINDS)
+    root = submit(bench, hold=1)
+    bench.wait(root, lambda _: any(child.state == "running" for child in blocks(bench, root)))
+    assert bench.cancel(root).state == "canceling"
+    job = bench.wait_until_finished(root)
+    assert (job.state, job.error) == ("canceled", None)
+    assert set(states(bench, root)) == {"canceled"}
+    bench.open_gate()
+    bench.retry(root)
+    assert bench.wait_until_finished(root).state == "succeeded"
+    assert bench.results(root) == {"sum.txt": DONE}
+
+
+def test_cancelled_whole_without_workers_ends_at_once(bench: WorkerHarness) -> None:
+    worker = bench.worker(**KINDS)
+    root = submit(bench, hold=1)
+    bench.wait(root, lambda _: any(child.state == "running" for child in blocks(bench, root)))
+    worker.terminate()
+    assert worker.wait(60) == 0
+    assert set(states(bench, root)) == {"queued"}
+    assert bench.cancel(root).state == "canceled"
+    assert set(states(bench, root)) == {"canceled"} and rows(bench, "procrastinate_jobs") == 0
+
+
+def test_retry_from_the_start_plans_anew(bench: WorkerHarness) -> None:
+    bench.worker(**KINDS)
+    root = submit(bench, refuse=2)
+    bench.wait_until_finished(root)
+    before = {child.id for child in blocks(bench, root)}
+    bench.open_gate()
+    bench.retry(root, fresh=True)
+    assert bench.wait_until_finished(root).state == "succeeded"
+    assert before.isdisjoint(child.id for child in blocks(bench, root))
+
+
+def test_lost_database_in_the_middle_is_outlived(bench: WorkerHarness) -> None:
+    bench.worker(**KINDS)
+    root = submit(bench, hold=1)
+    bench.wait(root, lambda _: any(child.state == "running" for child in blocks(bench, root)))
+    with bench.disconnect_database():
+        pass
+    bench.open_gate()
+    assert bench.wait_until_finished(root).state == "succeeded"
+    assert bench.results(root) == {"sum.txt": DONE}
