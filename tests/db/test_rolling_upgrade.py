@@ -26,6 +26,7 @@ STEPS = [step.name for step in all_migrations() if step.component == OWN_COMPONE
 BEFORE_USAGE = [name for name in STEPS if name < "0008"]
 BEFORE_LOCKS = [name for name in STEPS if name < "0012"]
 BEFORE_NUMBERS = [name for name in STEPS if name < "0016"]
+BEFORE_BLOCKS = [name for name in STEPS if name < "0023"]
 
 
 @pytest.fixture
@@ -129,6 +130,31 @@ def test_events_and_lines_of_both_versions_are_numbered_by_job(empty: str) -> No
                     f"SELECT number FROM {table} WHERE job_id = %s ORDER BY id".encode(), [job]
                 ).fetchall()
                 assert [number for (number,) in rows] == list(range(1, count + 1))
+
+
+def test_jobs_of_the_last_version_are_whole_jobs(empty: str) -> None:
+    migrate(empty, only=BEFORE_BLOCKS)
+    with psycopg.connect(empty) as connection:
+        fill(connection)
+    assert migrate(empty)[0] == "0023_blocks.sql"
+    with psycopg.connect(empty) as connection:
+        fill(connection)  # by a process of the former version
+        roles = connection.execute("SELECT root_id, role FROM jobs").fetchall()
+        assert roles == [(None, None)] * 2
+        assert usage(connection) == TRUTH
+        root = connection.execute("SELECT id FROM jobs").fetchone()
+        assert root is not None
+        connection.execute(
+            "INSERT INTO jobs (id, owner, kind, options, queue, root_id, role) "
+            "VALUES (%s, 'me', 'x', '{}', 'cpu', %s, 'block')",
+            [(block := uuid.uuid4()), root[0]],
+        )
+        connection.execute("INSERT INTO job_needs VALUES (%s, %s)", [root[0], block])
+        connection.execute("INSERT INTO artifacts VALUES (%s, 'a', %s, 10, '')", [block, "e" * 64])
+        connection.execute("DELETE FROM jobs WHERE role IS NULL")
+        assert connection.execute("SELECT count(*) FROM jobs").fetchone() == (0,)
+        assert connection.execute("SELECT count(*) FROM job_needs").fetchone() == (0,)
+        assert usage(connection) == 2 * 100
 
 
 def test_fsck_recount_corrects_usage(conninfo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

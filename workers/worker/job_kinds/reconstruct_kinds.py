@@ -6,7 +6,7 @@ from typing import Any
 from pydantic import Field
 
 from octasplat.engine.dataset.image_sizes import ImageSizes
-from octasplat.engine.operations.block_options import BlockOptions, check_block_options
+from octasplat.engine.operations.block_options import BlockOptions, check_block_options, parse_memory
 from octasplat.engine.operations.cost_model import (
     Estimate,
     estimate_reconstruction,
@@ -139,8 +139,12 @@ class ReconstructKind(OperationKind):
         )
 
     def estimate(self, options: ReconstructJobConfig, sizes: Sequence[ImageSizes], cores: int) -> Estimate:
-        """Return the time and memory that it takes, as a whole even if in blocks."""
-        return estimate_reconstruction(options, sizes, cores)
+        """Return the time that it takes as a whole, also in blocks, and the memory: of a block if given."""
+        found = estimate_reconstruction(options, sizes, cores)
+        if options.memory is None:
+            return found
+        memory_bytes = min(found.memory_bytes, parse_memory(options.memory))
+        return found.model_copy(update={"memory_bytes": memory_bytes})
 
 
 class BlockKind(JobKind[BlockJobConfig]):

@@ -1,0 +1,193 @@
+"""Jobs in blocks in the tables: queued once, released once, and settled whoever has died in between."""
+
+import asyncio
+import uuid
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from octasplat.engine.core import versions
+from octasplat.workers.db.connections import Pool, open_pool
+from octasplat.workers.db.errors import ConflictError
+from octasplat.workers.db.quotas import Quota, QuotaExceededError, check_new_job, set_quota, usage_of
+from octasplat.workers.db.rows import Job
+from octasplat.workers.queue.attempts import Attempt, FencedError, ResultFile
+from octasplat.workers.queue.block_jobs import (
+    NewBlock,
+    blocks_of,
+    cancel_job,
+    files_from_others,
+    settle_root,
+    unsettled_roots,
+)
+from octasplat.workers.queue.fair_share import choose_job
+from octasplat.workers.queue.jobs import create_job, list_jobs, retry_job
+from octasplat.workers.queue.recovery import StalledAttempts, recover_stalled_jobs
+from octasplat.workers.queue.storage_leases import storage_lease
+from octasplat.workers.queue.usage_figures import running_by_queue
+from octasplat.workers.storage.local import LocalStorage
+from tests.support.queue_jobs import NEW, SLIPS, claimed, fetched
+
+PLANNED = "f" * 64
+
+
+def checkpoint() -> dict[str, object]:
+    files = [{"path": "run/blocks/plan.npz", "sha256": PLANNED, "size_bytes": 7}]
+    return {"attempt": 1, "stage": "train", "step": 5, "files": files, "results": versions.RESULTS_VERSION}
+
+
+async def start(pool: Pool, folder: Path, attempt: Attempt, numbers: Sequence[int] = (1, 2)) -> Job:
+    """Let an attempt plan blocks; return the job that waits for them."""
+    blocks = [NewBlock(n, 10 * n, {"number": n, "iterations": 10 * n, "plan": PLANNED}) for n in numbers]
+    async with storage_lease(pool, LocalStorage(folder, floor_bytes=0)) as lease:
+        await attempt.start_blocks(
+            SLIPS, checkpoint(), "toy", blocks, lease, first_steps=5, total_steps=5 + 10 * sum(numbers)
+        )
+    return await fetched(pool, attempt.job.id)
+
+
+async def children(pool: Pool, root: uuid.UUID) -> list[Job]:
+    async with pool.connection() as connection:
+        return await blocks_of(connection, [root])
+
+
+async def settle(pool: Pool, root: uuid.UUID) -> Job:
+    async with pool.connection() as connection:
+        await settle_root(connection, SLIPS, root)
+    return await fetched(pool, root)
+
+
+@pytest.fixture(name="folder")
+def store_folder(tmp_path: Path) -> Path:
+    storage = LocalStorage(tmp_path, floor_bytes=0)
+    storage.close()
+    return tmp_path
+
+
+async def test_last_block_that_succeeds_queues_the_whole_once(conninfo: str, folder: Path) -> None:
+    async with open_pool(conninfo, max_size=6) as pool:
+        attempt = await claimed(pool)
+        root = await start(pool, folder, attempt)
+        assert (root.state, root.heartbeat_at, root.worker, root.step) == ("running", None, None, 5)
+        for write in (attempt.heartbeat, attempt.cancel):  # its attempt is over
+            with pytest.raises(FencedError):
+                await write()
+        blocks = await children(pool, root.id)
+        assert [block.state for block in blocks] == ["queued", "queued"]
+        assert blocks[1].slip is not None and blocks[0].slip is not None and blocks[1].slip < blocks[0].slip
+        attempts = [await claimed(pool, block) for block in blocks]
+        async with pool.connection() as connection:
+            files = await files_from_others(connection, attempts[0].job)
+            assert [file.path for file in files] == ["run/blocks/plan.npz"]
+        results = [ResultFile(f"blocks/block_00{n}/best.npz", str(n) * 64, n, "x") for n in (1, 2)]
+        await asyncio.gather(
+            *(done.succeed([result], job_queue=SLIPS) for done, result in zip(attempts, results, strict=True))
+        )
+        root = await fetched(pool, root.id)
+        assert root.state == "queued"
+        last = await claimed(pool, root)
+        async with pool.connection() as connection:
+            files = await files_from_others(connection, last.job)
+            assert [(file.path, file.size_bytes) for file in files] == [
+                ("run/blocks/block_001/best.npz", 1),
+                ("run/blocks/block_002/best.npz", 2),
+            ]
+            assert (await usage_of(connection, "me")).bytes == 7 + 1 + 2
+        await last.succeed([ResultFile("scene.ply", "9" * 64, 100, "x")], job_queue=SLIPS)
+        async with pool.connection() as connection:
+            assert (await usage_of(connection, "me")).bytes == 100
+            assert await unsettled_roots(connection) == []
+
+
+async def test_one_job_is_listed_and_counted(conninfo: str, folder: Path) -> None:
+    async with open_pool(conninfo, max_size=6) as pool:
+        root = await start(pool, folder, await claimed(pool), (1, 2, 3))
+        async with pool.connection() as connection:
+            assert [job.id for job in await list_jobs(connection, owner="me")] == [root.id]
+            assert (await usage_of(connection, "me")).jobs == 1
+            await set_quota(connection, "me", Quota(max_jobs=2))
+            await check_new_job(connection, "me")
+            await create_job(connection, SLIPS, NEW)
+            with pytest.raises(QuotaExceededError):
+                await check_new_job(connection, "me")
+            # It keeps no worker busy while it waits.
+            assert await running_by_queue(connection) == {} and await running_by_queue(connection, "me") == {
+                "cpu": 1
+            }
+            with pytest.raises(ConflictError, match=str(root.id)):
+                await retry_job(
+                    connection, SLIPS, (await blocks_of(connection, [root.id]))[0].id, from_start=False
+                )
+
+
+async def test_blocks_of_one_owner_leave_others_their_turn(conninfo: str, folder: Path) -> None:
+    async with open_pool(conninfo, max_size=6) as pool:
+        root = await start(pool, folder, await claimed(pool), (1, 2, 3))
+        blocks = await children(pool, root.id)
+        await claimed(pool, blocks[2])
+        async with pool.connection() as connection:
+            other = await create_job(
+                connection, SLIPS, type(NEW)(owner="you", kind="toy", options={}, queue="cpu")
+            )
+        assert blocks[1].slip is not None
+        assert await choose_job(pool, SLIPS, blocks[1].id, blocks[1].slip) == (other.id, other.slip)
+
+
+async def test_recovery_leaves_a_waiting_job_and_settles_what_nobody_did(conninfo: str, folder: Path) -> None:
+    async with open_pool(conninfo, max_size=6) as pool:
+        root = await start(pool, folder, await claimed(pool))
+        assert await recover_stalled_jobs(pool, SLIPS, 0.0, StalledAttempts(0.0)) == 0
+        assert (await fetched(pool, root.id)).waits_for_blocks
+        for block in await children(pool, root.id):  # without a queue: as if the worker had died just then
+            await (await claimed(pool, block)).succeed([])
+        assert (await fetched(pool, root.id)).state == "running"
+        await recover_stalled_jobs(pool, SLIPS, 60.0, StalledAttempts(0.0))
+        assert (await fetched(pool, root.id)).state == "queued"
+
+
+async def test_failed_block_ends_the_others_and_the_whole(conninfo: str, folder: Path) -> None:
+    async with open_pool(conninfo, max_size=6) as pool:
+        root = await start(pool, folder, await claimed(pool), (1, 2, 3))
+        first, second, third = [await claimed(pool, block) for block in await children(pool, root.id)][:3]
+        await third.succeed([ResultFile("blocks/block_003/best.npz", "3" * 64, 3, "x")], job_queue=SLIPS)
+        await second.fail({"type": "training", "message": "It collapsed."})
+        assert (await settle(pool, root.id)).state == "canceling"
+        assert await first.read_state() == "canceling"
+        await first.cancel()
+        ended = await settle(pool, root.id)
+        assert ended.state == "failed" and ended.error == {
+            "type": "training",
+            "message": "Block 2 of 3 failed: It collapsed. The others' results are kept.",
+            "block": 2,
+        }
+        async with pool.connection() as connection:
+            await retry_job(connection, SLIPS, root.id, from_start=False)
+        root = await start(pool, folder, await claimed(pool, await fetched(pool, root.id)), (1, 2, 3))
+        assert [block.state for block in await children(pool, root.id)] == ["queued", "queued", "succeeded"]
+        assert root.error is None and root.checkpoint is not None
+
+
+async def test_cancelling_by_a_front_end_of_the_last_version_is_settled(conninfo: str, folder: Path) -> None:
+    """Which changes the state of a job that runs, and leaves the rest to its worker."""
+    async with open_pool(conninfo, max_size=6) as pool:
+        root = await start(pool, folder, await claimed(pool))
+        async with pool.connection() as connection:
+            await connection.execute("UPDATE jobs SET state = 'canceling' WHERE id = %s", [root.id])
+        await recover_stalled_jobs(pool, SLIPS, 60.0, StalledAttempts(0.0))
+        assert (await fetched(pool, root.id)).state == "canceled"
+        assert {block.state for block in await children(pool, root.id)} == {"canceled"}
+
+
+async def test_cancelling_and_succeeding_at_once_end_somehow(conninfo: str, folder: Path) -> None:
+    async with open_pool(conninfo, max_size=6) as pool:
+        for _ in range(5):
+            root = await start(pool, folder, await claimed(pool))
+            attempts = [await claimed(pool, block) for block in await children(pool, root.id)]
+
+            async def cancel(root_id: uuid.UUID = root.id) -> None:
+                async with pool.connection() as connection:
+                    await cancel_job(connection, SLIPS, root_id)
+
+            await asyncio.gather(cancel(), *(attempt.succeed([], job_queue=SLIPS) for attempt in attempts))
+            assert (await settle(pool, root.id)).state in ("canceled", "queued")
