@@ -24,8 +24,8 @@ class BlockOptions(Options):
 
     blocks: Annotated[int, Field(ge=1, le=10_000)] | Literal["auto"] | None = Field(
         None,
-        description="Train the scene in so many blocks: one process does so one after the other, a service on "
-        "all workers at once. auto takes the fewest that the number of photographs and the memory ask for, "
+        description="Train the scene in so many blocks, one after the other or, as a job of a service, on "
+        "all workers at once; auto takes the fewest that the number of photographs and the memory ask for, "
         "which is 1 for most scenes.",
     )
     memory: Annotated[str | None, Spelling(metavar="SIZE")] = Field(

@@ -182,7 +182,7 @@ class JobSummary(BaseModel):
     ) -> Self:
         """Return the view of a database row."""
         whole = whole_progress(row, stages)
-        made = ("stages", "queue_position", "notes", "progress", "total_seconds_left")
+        made = ("stages", "queue_position", "notes", "progress", "total_seconds_left", "blocks")
         names = {name for name in cls.model_fields if name not in made}
         row = row if shows_worker else replace(row, worker=None)
         values = {name: getattr(row, name) for name in names}
