@@ -11,7 +11,7 @@ from octasplat.engine.core.threads import available_threads
 from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.base import Operation, Request, Result, never_stop
 from octasplat.engine.operations.photograph_sizes import photograph_sizes
-from octasplat.engine.operations.reconstruct import ReconstructOptions
+from octasplat.engine.operations.reconstruct import PlainReconstructOptions
 from octasplat.engine.settings.fields import Positional, ReadPath, Spelling, Unit
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from octasplat.engine.runs.config import ReconstructionConfig
 
 
-class EstimateOptions(ReconstructOptions):
+class EstimateOptions(PlainReconstructOptions):
     """Options of the reconstruction to estimate, and the number of cores."""
 
     cores: Annotated[int, Unit("cores"), Spelling(metavar="N")] = Field(

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 _CONFIG, _METRICS, _REPORT, _SCENE = "config.json", "metrics.json", "report.html", "scene.ply"
 
 
-class ReconstructOptions(RunSettings, Options):
-    """Options of a reconstruction: a preset, and settings that differ from it."""
+class PlainReconstructOptions(RunSettings, Options):
+    """Options of a reconstruction as a whole: a preset, and settings that differ from it."""
 
     former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.RECONSTRUCT
 
@@ -135,7 +135,7 @@ class ReconstructOptions(RunSettings, Options):
 
     def _shortcut_settings(self) -> dict[str, Any]:
         """Return the training's settings that options beside ``train`` name."""
-        names = {name: info.metadata for name, info in ReconstructOptions.model_fields.items()}
+        names = {name: info.metadata for name, info in PlainReconstructOptions.model_fields.items()}
         return {
             mark.setting: getattr(self, name)
             for name, marks in names.items()
@@ -144,11 +144,11 @@ class ReconstructOptions(RunSettings, Options):
         }
 
 
-class ReconstructJobOptions(ReconstructOptions, BlockOptions):
-    """Options of a reconstruction that is queued."""
+class ReconstructOptions(PlainReconstructOptions, BlockOptions):
+    """Options of a reconstruction: a preset, settings that differ from it, and blocks if there are any."""
 
 
-class ReconstructRequest(ReconstructOptions, BlockOptions, Request):
+class ReconstructRequest(ReconstructOptions, Request):
     """Reconstruct SCENE, a folder with images/ and a COLMAP model in sparse/0, or with photographs alone.
 
     Where there is no model, COLMAP finds the poses of the photographs. SCENE may also be a video: its
@@ -213,16 +213,16 @@ class ReconstructResult(Result):
         return self.summary
 
 
-def options_from_json(requested: Mapping[str, Any]) -> ReconstructJobOptions:
+def options_from_json(requested: Mapping[str, Any]) -> ReconstructOptions:
     """Return the options of a queued reconstruction from JSON.
 
     Raises:
         InvalidSettingsError: an option is unknown or out of range.
     """
     try:
-        return ReconstructJobOptions.model_validate(dict(requested))
+        return ReconstructOptions.model_validate(dict(requested))
     except ValidationError as error:
-        raise InvalidSettingsError(refusals_from(error, ReconstructJobOptions)) from None
+        raise InvalidSettingsError(refusals_from(error, ReconstructOptions)) from None
 
 
 def run_config(request: ReconstructRequest) -> "ReconstructionConfig":

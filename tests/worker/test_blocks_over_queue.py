@@ -12,6 +12,7 @@ from octasplat.engine.pipeline import BlockRequest, reconstruct
 from octasplat.engine.runs.config import resolve_config
 from octasplat.workers.db.connections import Connection
 from octasplat.workers.db.datasets import NewFile, create_dataset, put_files
+from octasplat.workers.db.locks import lock_owner
 from octasplat.workers.db.rows import Job
 from octasplat.workers.queue.block_jobs import blocks_of
 from octasplat.workers.storage.factory import open_storage
@@ -20,14 +21,17 @@ from tests.support.worker_harness import WorkerHarness
 
 pytestmark = pytest.mark.heavy
 
+MAX_WAIT_SECONDS = 1200.0
+"""Several trainings follow each other, each in a process that begins anew."""
+
 TRAIN = {
-    "iterations": 60,
+    "iterations": 30,
     "rays_per_batch": 512,
     "sh_degree": 1,
     "max_gaussians": 600,
     "initial_points": 300,
     "probe_rays": 256,
-    "checkpoint_every": 20,
+    "checkpoint_every": 10,
     "background": "learnt",
     "exposure": True,
 }
@@ -36,7 +40,7 @@ SETTINGS = {"test_every": 4, "exports": ["mesh.ply"]}
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_tiny_dataset(tmp_path_factory, views=12, width_px=64, height_px=48)
+    return make_tiny_dataset(tmp_path_factory, views=10, width_px=64, height_px=48)
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +58,7 @@ def store_dataset(bench: WorkerHarness, scene: Path) -> uuid.UUID:
     storage = open_storage(bench.folder / "store")
 
     async def store(connection: Connection) -> uuid.UUID:
+        await lock_owner(connection, "me")
         dataset = await create_dataset(connection, owner="me", name="tiny")
         files = []
         for path in sorted(path for path in scene.rglob("*") if path.is_file()):
@@ -99,7 +104,7 @@ def test_one_worker_makes_the_bytes_of_one_process(
 ) -> None:
     bench.worker()
     root = submit(bench, scene, blocks=2)
-    bench.wait_until_finished(root)
+    bench.wait_until_finished(root, MAX_WAIT_SECONDS)
     check_results(bench, root, one_process)
     assert [child.attempt for child in blocks(bench, root)] == [1, 1] and bench.job(root).attempt == 2
 
@@ -107,21 +112,21 @@ def test_one_worker_makes_the_bytes_of_one_process(
 def test_two_workers_of_which_one_is_killed_make_the_same_bytes(
     bench: WorkerHarness, scene: Path, one_process: Path
 ) -> None:
-    soon = {"STALE_SECONDS": "6"}
+    soon: dict[str, Any] = {"STALE_SECONDS": "15"}
     workers = {name: bench.worker(name=name, **soon) for name in ("first", "second")}
     root = submit(bench, scene, blocks=2)
     bench.wait(root, lambda _: any(child.checkpoint and child.worker for child in blocks(bench, root)))
     busy = next(child for child in blocks(bench, root) if child.checkpoint and child.worker)
     assert busy.worker is not None
     workers[busy.worker].send_signal(signal.SIGKILL)
-    bench.wait_until_finished(root)
+    bench.wait_until_finished(root, MAX_WAIT_SECONDS)
     check_results(bench, root, one_process)
 
 
 def test_automatic_blocks_of_a_small_scene_are_no_blocks(bench: WorkerHarness, scene: Path) -> None:
     bench.worker()
     root = submit(bench, scene, blocks="auto")
-    job = bench.wait_until_finished(root)
+    job = bench.wait_until_finished(root, MAX_WAIT_SECONDS)
     assert (job.state, job.attempt, job.role) == ("succeeded", 1, None)
     assert "scene.ply" in bench.results(root)
 
@@ -133,6 +138,6 @@ def test_block_that_the_store_lost_fails_the_job_by_name(bench: WorkerHarness, s
     files = (bench.job(root).checkpoint or {})["files"]
     (plan,) = (file["sha256"] for file in files if file["path"].endswith("plan.npz"))
     open_storage(bench.folder / "store").delete(plan)
-    job = bench.wait_until_finished(root)
+    job = bench.wait_until_finished(root, MAX_WAIT_SECONDS)
     assert job.state == "failed" and job.error is not None
     assert job.error["message"].startswith("Block ") and plan[:8] in job.error["message"]

@@ -12,7 +12,7 @@ import click
 
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.operations.block_options import check_block_options
-from octasplat.engine.operations.reconstruct import ReconstructJobOptions
+from octasplat.engine.operations.reconstruct import ReconstructOptions
 from octasplat.engine.settings.renamed_settings import notify_renamed
 from octasplat.workers.cli.options import exports_option, parse_export_names
 from octasplat.workers.cli.printing import Printer, output_options
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     help="Where SCENE is an address: what the ZIP file must be; then it is fetched once only.",
 )
 @wait_options
-@request_options(ReconstructJobOptions)
+@request_options(ReconstructOptions)
 @job_options
 @output_options
 def submit(
@@ -62,7 +62,7 @@ def submit(
     from octasplat.workers.client.submission import Submission
 
     _check_output(output, wait=wait)
-    options: ReconstructJobOptions = request_from_options(ReconstructJobOptions, given)
+    options: ReconstructOptions = request_from_options(ReconstructOptions, given)
     check_block_options(options, options.config())  # what cannot be used is refused before anything is sent
     requested = options.model_dump(mode="json", exclude_unset=True)
     what = Submission(scene, requested, label, queue, priority, sha256)

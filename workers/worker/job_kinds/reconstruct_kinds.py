@@ -14,7 +14,7 @@ from octasplat.engine.operations.cost_model import (
     training_pixels,
 )
 from octasplat.engine.operations.reconstruct import OPERATION as RECONSTRUCT
-from octasplat.engine.operations.reconstruct import ReconstructJobOptions, options_from_json
+from octasplat.engine.operations.reconstruct import options_from_json
 from octasplat.engine.runs.config import ReconstructionConfig, revise_requested
 from octasplat.engine.train.config import MAX_PLANNED_ITERATIONS, iteration_count, max_gaussian_count
 from octasplat.workers.worker.job_kinds.operation_kind import OperationKind
@@ -56,7 +56,6 @@ class ReconstructKind(OperationKind):
             title="Photographs to a scene, its meshes and measurements",
             stages=(),
             needs="dataset",
-            options=ReconstructJobOptions,
             complete_options=ReconstructJobConfig,
             program=f"{_PROGRAMS}:reconstruct",
             reports_stages=True,

@@ -1,0 +1,124 @@
+"""The programs of jobs in blocks hand over through the store what makes the bytes of one process."""
+
+import json
+import uuid
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from octasplat.engine.core.events import CheckpointWritten, Event
+from octasplat.engine.pipeline import BlockRequest, reconstruct
+from octasplat.workers.db.rows import Job
+from octasplat.workers.storage.local import LocalStorage
+from octasplat.workers.storage.trees import TreeFile
+from octasplat.workers.worker.checkpoint import Checkpoint, plan_digest
+from octasplat.workers.worker.job_kinds import get_job_kind
+from octasplat.workers.worker.job_kinds.reconstruct_kinds import ReconstructJobConfig
+from octasplat.workers.worker.reconstruct_handler import reconstruct as run_whole
+from octasplat.workers.worker.reconstruct_handler import train_block
+from octasplat.workers.worker.task import BlocksPlanned, Task
+from octasplat.workers.worker.workspace import Workspace
+from tests.support.tiny_dataset import make_tiny_dataset
+
+pytestmark = pytest.mark.heavy
+
+REQUESTED = {
+    "train": {
+        **{"iterations": 30, "rays_per_batch": 512, "sh_degree": 1, "max_gaussians": 600},
+        **{"initial_points": 300, "probe_rays": 256, "checkpoint_every": 10},
+        **{"background": "learnt", "exposure": True},
+    },
+    "test_every": 4,
+    "exports": ["mesh.ply"],
+}
+NOW = datetime.now(UTC)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_tiny_dataset(tmp_path_factory, views=10, width_px=64, height_px=48)
+
+
+def make_job(options: dict[str, Any], role: str, attempt: int = 1) -> Job:
+    """A row as a worker claims it."""
+    nothing = dict.fromkeys(Job.__dataclass_fields__)
+    given = {"id": uuid.uuid4(), "kind": "reconstruct", "options": options, "role": role, "attempt": attempt}
+    return Job(**{**nothing, **given, "fresh_after": 0, "created_at": NOW})  # type: ignore[arg-type]
+
+
+def run_task(
+    program: Any, workspace: Workspace, options: dict[str, Any], scene: Path
+) -> tuple[list[Event], Workspace]:
+    events: list[Event] = []
+    program(Task(workspace.folder, options, scene=scene, title="tiny", threads=1, progress=events.append))
+    return events, workspace
+
+
+def test_programs_hand_over_what_makes_the_bytes_of_one_process(scene: Path, tmp_path: Path) -> None:
+    kind = get_job_kind("reconstruct")
+    complete = kind.resolve({**REQUESTED, "blocks": 2})
+    assert isinstance(complete, ReconstructJobConfig)
+    options = complete.model_dump(mode="json")
+    photographs = tmp_path / "datasets" / "id" / "tiny"
+    photographs.parent.mkdir(parents=True)
+    photographs.symlink_to(scene)
+    whole = reconstruct(
+        scene, tmp_path / "whole", complete.run_config(), threads=1, blocks=BlockRequest(count=2)
+    )
+    storage = LocalStorage(tmp_path / "store", floor_bytes=0)
+
+    root = make_job(options, "root")
+    first = Workspace(tmp_path / "work", root, storage)
+    first.open()
+    events, _ = run_task(run_whole, first, options, photographs)
+    (planned,) = [event for event in events if isinstance(event, BlocksPlanned)]
+    assert planned.numbers == (1, 2) and planned.first_iterations == 15
+    assert planned.total_iterations == 15 + 2 * 30 + 20
+    assert not (first.folder / "results").exists()
+    checkpoint = first.store_checkpoint("train", 15)
+    assert checkpoint is not None
+    names = {file.path.removeprefix("run/") for file in checkpoint.files}
+    pieces = {"request.json", "plan.npz", "coarse/best.npz", "coarse/piece.json"}
+    assert {name for name in names if name.startswith("blocks/")} == {f"blocks/{name}" for name in pieces}
+    assert {"config.json", "views.json", "held_out.json", "events.jsonl"} < names
+    digest = plan_digest(checkpoint)
+    assert len(digest) == 129
+
+    made: list[TreeFile] = []
+    for number in (2, 1):
+        given = kind.options_of_block(complete, number, 30, digest)
+        assert get_job_kind(kind.block_kind).options.model_validate(given).number == number
+        block = Workspace(tmp_path / f"other-{number}", make_job(given, "block"), storage)
+        block.open()
+        block.fetch_from_others(checkpoint.files)
+        events, _ = run_task(train_block, block, given, photographs)
+        assert 10 in [event.iteration for event in events if isinstance(event, CheckpointWritten)]
+        own = block.store_checkpoint("train", 30)
+        assert own is not None
+        folder = f"run/blocks/block_{number:03d}"
+        assert {file.path for file in own.files} == {f"{folder}/best.npz", f"{folder}/piece.json"}
+        made += [TreeFile(path=f"run/{f.path}", sha256=f.sha256, size_bytes=f.size_bytes)
+                 for f in block.store_results().files]  # fmt: skip
+        block.close()
+    assert len(made) == 4
+
+    last = Workspace(tmp_path / "third", replace(root, attempt=2), storage)
+    last.open()
+    last.restore(Checkpoint.from_row(checkpoint.as_row()))
+    last.fetch_from_others(made)
+    events, _ = run_task(run_whole, last, options, photographs)
+    assert not any(isinstance(event, BlocksPlanned) for event in events)
+    steps = [event.iteration for event in events if isinstance(event, CheckpointWritten)]
+    assert steps and min(steps) >= 15 + 2 * 30  # they count what was before
+    for name in ("scene.ply", "mesh.ply", "background.exr", "views.json", "held_out.json"):
+        assert (last.folder / "results" / name).read_bytes() == (whole / name).read_bytes(), name
+    record = json.loads((last.folder / "results" / "training.json").read_text())
+    assert list(record["pieces"]) == ["coarse", "block_001", "block_002", "finish"]
+    assert not (last.folder / "results" / "blocks").exists()
+    kept = last.store_checkpoint("export", 1)
+    assert kept is not None and not any(file.path.endswith(".npz") for file in kept.files)
+    for workspace in (first, last):
+        workspace.close()
