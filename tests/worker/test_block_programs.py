@@ -95,7 +95,7 @@ def test_programs_hand_over_what_makes_the_bytes_of_one_process(scene: Path, tmp
         block.open()
         block.fetch_from_others(checkpoint.files)
         events, _ = run_task(train_block, block, given, photographs)
-        assert 10 in [event.iteration for event in events if isinstance(event, CheckpointWritten)]
+        assert 25 in [event.iteration for event in events if isinstance(event, CheckpointWritten)]
         own = block.store_checkpoint("train", 30)
         assert own is not None
         folder = f"run/blocks/block_{number:03d}"
