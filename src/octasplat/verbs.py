@@ -119,8 +119,9 @@ def reconstruct(
     Args:
         source: The folder of the photographs, or a video.
         output: Folder for the results.
-        blocks: Train the scene in so many blocks, one after the other; auto takes the fewest that the
-            number of photographs and the memory ask for, which is 1 for most scenes.
+        blocks: Train the scene in so many blocks, one after the other or, as a job of a service, on all
+            workers at once; auto takes the fewest that the number of photographs and the memory ask
+            for, which is 1 for most scenes.
         memory: With blocks: about the most memory that the training of one takes, such as 8G; blocks
             have no more Gaussians than that holds.
         preset: Where the settings of the training come from. fast: a first look, the fastest and less
@@ -433,8 +434,9 @@ def plan(
         source: The folder of the photographs and their model.
         overwrite: Replace files that are there already, too, which are not of an earlier run of this
             command or were changed since. What is read is never replaced.
-        blocks: Train the scene in so many blocks, one after the other; auto takes the fewest that the
-            number of photographs and the memory ask for, which is 1 for most scenes.
+        blocks: Train the scene in so many blocks, one after the other or, as a job of a service, on all
+            workers at once; auto takes the fewest that the number of photographs and the memory ask
+            for, which is 1 for most scenes.
         memory: With blocks: about the most memory that the training of one takes, such as 8G; blocks
             have no more Gaussians than that holds.
         preset: Where the settings of the training come from. fast: a first look, the fastest and less
