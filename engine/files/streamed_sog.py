@@ -22,7 +22,6 @@ from octasplat.engine.files.sog import META_FILE, find_sog_losses
 from octasplat.engine.files.splat_rows import select_for_export
 from octasplat.engine.files.splat_transform import convert_levels, missing_converter
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.gaussians.simplification import simplify
 
 INDEX_FILE = "lod-meta.json"
 _CHUNK_META = re.compile(r"(\d+_\d+)/meta\.json")
@@ -40,6 +39,9 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
         SceneFileError: nothing to write, values that are not finite, or the program is missing or fails.
         OSError: a file cannot be written.
     """
+    # imported late: the table of formats is read where nothing is written, too
+    from octasplat.engine.gaussians.simplification import simplify
+
     scene = select_for_export(gaussians, path, options)
     former = _former_chunks(path)
     low, high = np.quantile(scene.means_world, [0.02, 0.98], axis=0)
