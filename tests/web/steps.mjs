@@ -112,7 +112,8 @@ const steps = {
         const listenTo = (page) => page.on("request", (request) => { if (request.method() === "PUT") puts.push(decodeURIComponent(new URL(request.url()).pathname.split("/files/")[1])); });
 
         listenTo(page);
-        let let_through = job.first;
+        let let_through = job.first, arrived = 0;
+        page.on("requestfinished", (request) => { if (request.method() === "PUT" && request.url().includes("/files/")) arrived += 1; });
         await page.route("**/files/**", (route) => {
             if (route.request().method() !== "PUT" || let_through-- > 0) route.continue();
             else route.abort("connectionfailed");
@@ -132,6 +133,7 @@ const steps = {
         await chosen("still life: ");
         await page.click("#start");
         await page.waitForFunction(() => /connection is lost/.test(document.getElementById("going-text").textContent));
+        while (arrived < job.first) await page.waitForTimeout(50); // several are sent at once
         await shot(page, "interrupted");
         await page.context().close();
         found.firstPuts = puts.splice(0);
