@@ -20,6 +20,7 @@ from octasplat.service.intake.input_files import check_input_files
 from octasplat.service.problems import problem_from_error, unexpected_problem
 from octasplat.service.state import Service
 from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
+from octasplat.workers.db import dataset_checks as checks
 from octasplat.workers.db import datasets as rows
 from octasplat.workers.db.connections import Connection, retry_on_deadlock
 from octasplat.workers.db.dataset_tasks import DatasetTask, tasks_of
@@ -58,14 +59,14 @@ async def request_commit(service: Service, principal: Principal, dataset_id: uui
                 "are over."
             )
         await check_share(connection, service.settings.check_shares(), owner, "commit")
-        await rows.announce_check(connection, dataset)
+        await checks.announce_check(connection, dataset)
         return await new_task(service, connection, dataset, "commit")
 
 
 async def run_commit(service: Service, task: DatasetTask) -> TaskOutcome:
     """Validate a dataset; the outcome commits it, or opens it again with what is wrong."""
     async with service.pool.connection() as connection:
-        check = await rows.begin_check(connection, task.dataset_id)
+        check = await checks.begin_check(connection, task.dataset_id)
         if check.dataset.state == "committed":
             return TaskOutcome()
         files = await rows.files_of(connection, task.dataset_id)
@@ -94,22 +95,22 @@ async def _validate(
     return await run_in_pool(ThreadPurpose.CHECKS, check_dataset, service.storage, known, limits)
 
 
-async def _renew_check(service: Service, check: rows.Check) -> None:
+async def _renew_check(service: Service, check: checks.Check) -> None:
     """Renew the validation regularly; without that it counts as abandoned."""
     while True:
         # Several tries may fail before the validation counts as abandoned.
         await asyncio.sleep(rows.STALE_CHECK_SECONDS / 6)
         with suppress(psycopg.Error, PoolTimeout):
             async with service.pool.connection() as connection:
-                await rows.renew_check(connection, check)
+                await checks.renew_check(connection, check)
 
 
-async def _reopen(connection: Connection, check: rows.Check) -> None:
-    await rows.end_check(connection, check, is_valid=False)
+async def _reopen(connection: Connection, check: checks.Check) -> None:
+    await checks.end_check(connection, check, is_valid=False)
 
 
 async def _commit(
-    connection: Connection, check: rows.Check, summary: DatasetSummary | dict[str, Any]
+    connection: Connection, check: checks.Check, summary: DatasetSummary | dict[str, Any]
 ) -> None:
     """Record a dataset as valid.
 
@@ -117,11 +118,11 @@ async def _commit(
         ConflictError: it was opened meanwhile, as by a process that took this one for lost.
     """
     if isinstance(summary, dict):
-        dataset = await rows.end_check(connection, check, is_valid=True, facts=summary)
+        dataset = await checks.end_check(connection, check, is_valid=True, facts=summary)
     else:
         facts: dict[str, Any] = asdict(summary)
         photographs, has_poses = facts.pop("photographs"), facts.pop("has_model")
-        dataset = await rows.end_check(
+        dataset = await checks.end_check(
             connection, check, is_valid=True, has_poses=has_poses, photographs=photographs, facts=facts
         )
     if dataset.state != "committed":

@@ -12,8 +12,8 @@ import pytest
 from psycopg.types.json import Jsonb
 
 from octasplat.workers.db.connections import Connection, Pool, open_pool
+from octasplat.workers.db.dataset_checks import begin_check
 from octasplat.workers.db.datasets import (
-    begin_check,
     change_dataset,
     create_dataset,
     get_dataset,
@@ -28,7 +28,8 @@ from octasplat.workers.maintenance.retention import (
     delete_expired,
     update_expiry_times,
 )
-from octasplat.workers.queue.attempts import Attempt, ResultFile, claim
+from octasplat.workers.queue.attempts import Attempt, ResultFile
+from octasplat.workers.queue.claims import claim
 from octasplat.workers.queue.jobs import NewJob, artifacts_of, change_job, create_job, get_job, retry_job
 from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
 from octasplat.workers.storage.local import LocalStorage

@@ -12,9 +12,10 @@ from octasplat.workers.db.events_and_logs import list_job_events, list_log_lines
 from octasplat.workers.db.ids import new_id
 from octasplat.workers.db.locks import ROW_SECONDS, try_lock_recovery
 from octasplat.workers.db.rows import Job
-from octasplat.workers.queue import attempts
-from octasplat.workers.queue.attempts import Attempt, claim
+from octasplat.workers.queue import claims
+from octasplat.workers.queue.attempts import Attempt
 from octasplat.workers.queue.block_jobs import cancel_job
+from octasplat.workers.queue.claims import claim
 from octasplat.workers.queue.job_endings import recover_attempt
 from octasplat.workers.queue.jobs import get_job
 from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
@@ -103,7 +104,7 @@ async def test_claim_begins_an_attempt_anew(conninfo: str, monkeypatch: pytest.M
         await first.set_progress(stage="train", step=3, total_steps=9, seconds_left=5.0)
         await first.add_log_lines(["a", "b", "c"])
         await first.requeue(SLIPS, "test")
-        monkeypatch.setattr(attempts, "MAX_EARLIER_LOG_LINES", 2)
+        monkeypatch.setattr(claims, "MAX_EARLIER_LOG_LINES", 2)
         again = await fetched(pool, job.id)
         assert again.slip is not None
         second = await claim(pool, job.id, again.slip, "other")

@@ -5,7 +5,7 @@ from collections import Counter
 from octasplat.workers.db.connections import Pool, open_pool
 from octasplat.workers.db.quotas import Quota, set_quota
 from octasplat.workers.db.rows import Job
-from octasplat.workers.queue.attempts import claim
+from octasplat.workers.queue.claims import claim
 from octasplat.workers.queue.fair_share import choose_job
 from octasplat.workers.queue.jobs import NewJob, create_job, get_job, queue_position, requeue_job
 from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue

@@ -7,7 +7,7 @@ from octasplat.workers.db.connections import open_pool
 from octasplat.workers.db.holds import set_queue_paused
 from octasplat.workers.db.ids import new_id
 from octasplat.workers.db.workers import record_worker_heartbeat
-from octasplat.workers.queue.attempts import claim
+from octasplat.workers.queue.claims import claim
 from octasplat.workers.queue.job_deadlines import fail_abandoned_jobs
 from octasplat.workers.queue.jobs import NewJob, create_job, get_job
 from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue

@@ -15,7 +15,7 @@ from octasplat.service.intake.dataset import DatasetSummary
 from octasplat.service.intake.faults import IntakeError, IntakeFault
 from octasplat.service.routes.preferences import seconds_to_wait
 from octasplat.workers.db import dataset_tasks as rows
-from octasplat.workers.db.datasets import begin_check, end_check, reopen_stale_checks
+from octasplat.workers.db.dataset_checks import begin_check, end_check, reopen_stale_checks
 from tests.support.service_harness import ConnectService, task_over
 
 PATIENCE_SECONDS = 60.0

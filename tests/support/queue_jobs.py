@@ -7,7 +7,8 @@ from typing import Any
 
 from octasplat.workers.db.connections import Pool, open_pool
 from octasplat.workers.db.rows import Job
-from octasplat.workers.queue.attempts import Attempt, claim
+from octasplat.workers.queue.attempts import Attempt
+from octasplat.workers.queue.claims import claim
 from octasplat.workers.queue.jobs import NewJob, create_job, get_job
 from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
 

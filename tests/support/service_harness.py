@@ -16,7 +16,8 @@ from octasplat.service.settings import ServiceSettings
 from octasplat.service.state import Service
 from octasplat.workers.db.connections import open_pool
 from octasplat.workers.db.tokens import LOCAL_OWNER, add_token, new_secret
-from octasplat.workers.queue.attempts import Attempt, claim
+from octasplat.workers.queue.attempts import Attempt
+from octasplat.workers.queue.claims import claim
 from octasplat.workers.storage.trees import Manifest
 
 TOKEN = new_secret()

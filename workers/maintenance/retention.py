@@ -12,8 +12,9 @@ from psycopg import sql
 
 from octasplat.workers.db.audit import delete_old_entries
 from octasplat.workers.db.connections import Connection, Pool
+from octasplat.workers.db.dataset_checks import reopen_stale_checks
 from octasplat.workers.db.dataset_tasks import delete_old_tasks
-from octasplat.workers.db.datasets import get_dataset, reopen_stale_checks
+from octasplat.workers.db.datasets import get_dataset
 from octasplat.workers.db.errors import ConflictError
 from octasplat.workers.db.locks import about_to_lock_jobs, lock_owner
 from octasplat.workers.db.sessions import delete_old_sessions

@@ -4,19 +4,18 @@ A worker that was taken for dead may come back. By then its job has a higher att
 its writes are refused with :class:`FencedError`.
 """
 
-import uuid
 from collections.abc import AsyncIterator, Callable, Collection, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import Any
 
 from octasplat.workers.db.connections import Connection, Pool
-from octasplat.workers.db.events_and_logs import add_event, add_log_lines, trim_log
+from octasplat.workers.db.events_and_logs import add_event, add_log_lines
 from octasplat.workers.db.live_scenes import LiveScene, put_live_scene
 from octasplat.workers.db.locks import lock_owner
 from octasplat.workers.db.postgres_text import as_json, storable_text
 from octasplat.workers.db.quotas import NO_QUOTA, Quota, check_bytes
-from octasplat.workers.db.rows import TERMINAL, Job
+from octasplat.workers.db.rows import Job
 from octasplat.workers.queue.block_jobs import (
     ROOT,
     NewBlock,
@@ -24,13 +23,10 @@ from octasplat.workers.queue.block_jobs import (
     release_needs,
     start_blocks,
 )
-from octasplat.workers.queue.job_endings import MAX_RECOVERIES, end_job, recover_attempt
+from octasplat.workers.queue.job_endings import MAX_RECOVERIES, count_requeues, end_job, recover_attempt
 from octasplat.workers.queue.jobs import get_job, requeue_job
 from octasplat.workers.queue.protocol import JobQueue
 from octasplat.workers.queue.storage_leases import StorageLease
-
-MAX_EARLIER_LOG_LINES = 20_000
-"""Lines of the attempts before that stay in the log when a new one begins."""
 
 
 class FencedError(Exception):
@@ -286,7 +282,7 @@ class Attempt:
                 return
             # In the form that the events keep, by which it is counted.
             reason = storable_text(self.redact(reason))
-            if max_uncounted is not None and await _count_requeues(connection, job, reason) >= max_uncounted:
+            if max_uncounted is not None and await count_requeues(connection, job, reason) >= max_uncounted:
                 error = {"type": "worker_failed", "message": f"Handed back too often: {reason}."}
                 await recover_attempt(connection, job_queue, job, error, keep_entry=True)
                 return
@@ -371,53 +367,6 @@ class Attempt:
         is_ours = job is not None and job.attempt == self.job.attempt and job.heartbeat_at is not None
         if job is None or not is_ours or job.state not in ("running", "canceling"):
             raise FencedError(f"attempt {self.job.attempt} of job {self.job.id} is over")
-
-
-async def _count_requeues(connection: Connection, job: Job, reason: str) -> int:
-    """Return how often a job was requeued for a reason since it last advanced or was accepted."""
-    cursor = await connection.execute(
-        """
-        SELECT count(*) AS n FROM job_events
-        WHERE job_id = %(job)s AND kind = 'handed_back' AND data->>'reason' = %(reason)s
-          AND id > coalesce((
-            SELECT max(id) FROM job_events WHERE job_id = %(job)s
-              AND (kind = 'checkpoint' OR kind = 'state' AND data->>'state' = ANY(%(over)s))), 0)
-        """,
-        {"job": job.id, "reason": reason, "over": list(TERMINAL)},
-    )
-    row = await cursor.fetchone()
-    return int(row["n"]) if row else 0
-
-
-async def claim(pool: Pool, job_id: uuid.UUID, entry_id: int, worker: str) -> Attempt | None:
-    """Begin an attempt at a queued job; None if the entry is stale because the job has continued."""
-    async with pool.connection() as connection, connection.transaction():
-        job = await get_job(connection, job_id, lock=True)
-        if job is None or job.state != "queued" or job.slip != entry_id:
-            return None
-        await connection.execute(
-            """
-            UPDATE jobs SET state = 'running', attempt = attempt + 1, worker = %s, started_at = now(),
-                heartbeat_at = now(), stage = NULL, step = NULL, total_steps = NULL
-            WHERE id = %s
-            """,
-            [worker, job_id],
-        )
-        # The order of turns in fair_share; not now(), which is the time at which the transaction began.
-        await connection.execute(
-            """
-            INSERT INTO owner_turns (owner, queue) VALUES (%s, %s)
-            ON CONFLICT (owner, queue) DO UPDATE SET turn_at = clock_timestamp()
-            """,
-            [job.owner, job.queue],
-        )
-        # ``job`` is the row as it was before the update.
-        await add_event(connection, job_id, job.attempt + 1, "state", {"state": "running", "worker": worker})
-        await trim_log(connection, job_id, MAX_EARLIER_LOG_LINES)
-        await add_log_lines(connection, job_id, job.attempt + 1, [f"Attempt {job.attempt + 1}"])
-        claimed = await get_job(connection, job_id)
-    assert claimed is not None
-    return Attempt(pool, claimed)
 
 
 @asynccontextmanager

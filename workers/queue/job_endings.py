@@ -7,7 +7,7 @@ from octasplat.workers.db.connections import Connection
 from octasplat.workers.db.events_and_logs import add_event, add_log_lines
 from octasplat.workers.db.live_scenes import remove_live_scene
 from octasplat.workers.db.postgres_text import as_json_or_null
-from octasplat.workers.db.rows import Job
+from octasplat.workers.db.rows import TERMINAL, Job
 from octasplat.workers.queue.jobs import requeue_job
 from octasplat.workers.queue.protocol import JobQueue
 
@@ -94,6 +94,22 @@ async def _count_same_losses(connection: Connection, job: Job, error: Mapping[st
         """,
         # Progress sets ``rescues`` to 0, so that so many of the newest rows are those since then.
         [job.id, job.rescues, error.get("type")],
+    )
+    row = await cursor.fetchone()
+    return int(row["n"]) if row else 0
+
+
+async def count_requeues(connection: Connection, job: Job, reason: str) -> int:
+    """Return how often a job was requeued for a reason since it last advanced or was accepted."""
+    cursor = await connection.execute(
+        """
+        SELECT count(*) AS n FROM job_events
+        WHERE job_id = %(job)s AND kind = 'handed_back' AND data->>'reason' = %(reason)s
+          AND id > coalesce((
+            SELECT max(id) FROM job_events WHERE job_id = %(job)s
+              AND (kind = 'checkpoint' OR kind = 'state' AND data->>'state' = ANY(%(over)s))), 0)
+        """,
+        {"job": job.id, "reason": reason, "over": list(TERMINAL)},
     )
     row = await cursor.fetchone()
     return int(row["n"]) if row else 0

@@ -6,7 +6,6 @@ import math
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from enum import Enum
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -27,8 +26,6 @@ from octasplat.workers.sandbox.confinement import MAX_PROCESSES
 from octasplat.workers.storage.errors import (
     BlobNotFoundError,
     DigestMismatchError,
-    StorageError,
-    StorageFullError,
     UntrustedFileError,
 )
 from octasplat.workers.storage.untrusted_folder import MAX_DEPTH
@@ -42,6 +39,7 @@ from octasplat.workers.worker.kernels import compile_for_job
 from octasplat.workers.worker.outcomes import OutcomeWriter
 from octasplat.workers.worker.path_redaction import PathRedactor, redact_json
 from octasplat.workers.worker.reporter import Reporter
+from octasplat.workers.worker.stop_reasons import StopReason, disk_stop_reason
 from octasplat.workers.worker.task import EXIT_REFUSED, EXIT_STOPPED, EXIT_UNEXPECTED, NO_SPACE_ERROR
 from octasplat.workers.worker.workspace import Workspace
 
@@ -51,23 +49,6 @@ T = TypeVar("T")
 MAX_CANCEL_SECONDS = 10.0
 _WATCH_POOL = ThreadPoolExecutor(1, "watch")
 """A thread for watching children; the common ones may all be waiting for a store that is cut off as well."""
-
-
-class StopReason(Enum):
-    """Reason for which a child process was stopped early."""
-
-    FENCED = "the job has gone on without this worker"
-    DATABASE_LOST = "the database was lost"
-    CANCELED = "its owner cancelled it"
-    DRAINING = "its worker is stopping"
-    SILENT = "its program said nothing for too long"
-    TIME_LIMIT = "it ran for longer than allowed"
-    MEMORY_LIMIT = "its program needed more memory than allowed"
-    PROCESS_LIMIT = "it started more processes than allowed"
-    DISK_LIMIT = "its folder took more than allowed"
-    DISK_RESERVE = "it took room that is reserved"
-    HIDDEN_FILES = "its folder could not be measured"
-    UNWATCHED = "its limits could not be watched any more"
 
 
 class Supervisor:
@@ -382,24 +363,9 @@ class Supervisor:
             await self._watch_disk()
 
     async def _watch_disk(self) -> None:
-        """Stop a child that fills the disk; of several the one that used most."""
-        around, loop = self._context, asyncio.get_running_loop()
-        try:
-            taken = await loop.run_in_executor(_WATCH_POOL, self._workspace.used_bytes)
-        except UntrustedFileError as error:
-            logger.info("job %s hides what it stores: %s", self._job.id, error)
-            self._stop(StopReason.HIDDEN_FILES)
-            return
-        around.taken_bytes[self._job.id] = taken
-        if 0 < self._settings.max_workspace_bytes < taken:
-            self._stop(StopReason.DISK_LIMIT)
-        try:
-            await loop.run_in_executor(_WATCH_POOL, around.disk_space.ensure_workspace, 0)
-        except StorageFullError:
-            if taken >= max(around.taken_bytes.values()):
-                self._stop(StopReason.DISK_RESERVE)
-        except StorageError as error:
-            logger.info("the disk of job %s was not looked at: %s", self._job.id, error)
+        """Stop a child that fills the disk."""
+        if reason := await disk_stop_reason(self._context, self._workspace, self._job.id, _WATCH_POOL):
+            self._stop(reason)
 
     def _on_limits_end(self, limits: "asyncio.Task[None]") -> None:
         """Stop a child that nobody watches; the watch ends with it, or by an error."""

@@ -8,13 +8,11 @@ import os
 import platform
 import signal
 import socket
-import tempfile
 import time
 import uuid
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import psutil
@@ -29,17 +27,13 @@ from octasplat.workers.db.connections import Pool, open_pool
 from octasplat.workers.db.holds import read_holds
 from octasplat.workers.db.ids import new_id
 from octasplat.workers.db.migrate import wait_for_tables
-from octasplat.workers.db.workers import record_worker_heartbeat, remove_stale_workers, remove_worker
-from octasplat.workers.maintenance.garbage_collection import collect_garbage
-from octasplat.workers.maintenance.retention import apply_retention, thin_progress_events
-from octasplat.workers.maintenance.webhooks.sender import WebhookSender
+from octasplat.workers.db.workers import record_worker_heartbeat, remove_worker
 from octasplat.workers.parent_death_signal import die_with_local_service
-from octasplat.workers.queue.attempts import Attempt, FencedError, claim
+from octasplat.workers.queue.attempts import Attempt, FencedError
 from octasplat.workers.queue.block_jobs import settle_root
+from octasplat.workers.queue.claims import claim
 from octasplat.workers.queue.fair_share import choose_job
-from octasplat.workers.queue.job_deadlines import fail_abandoned_jobs
 from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
-from octasplat.workers.queue.recovery import StalledAttempts, recover_stalled_jobs
 from octasplat.workers.sandbox.capabilities import log_missing_capabilities, sandbox_capabilities
 from octasplat.workers.sandbox.hiding import forbid_memory_access
 from octasplat.workers.sandbox.job_users import check_job_users
@@ -53,23 +47,15 @@ from octasplat.workers.worker.capability import reason_incapable, version_facts
 from octasplat.workers.worker.context import DatabaseLostError, WorkerContext
 from octasplat.workers.worker.heartbeat import DATABASE_ERRORS
 from octasplat.workers.worker.host_health import HostHealth
+from octasplat.workers.worker.housekeeping import Housekeeping
 from octasplat.workers.worker.kernels import compile_in_background
 from octasplat.workers.worker.memory_limit import memory_limit_bytes
 from octasplat.workers.worker.periodic_tasks import PeriodicTask, PeriodicTaskError, run_periodically
 from octasplat.workers.worker.supervisor import Supervisor
-from octasplat.workers.worker.workspace_locks import sweep_temporary, sweep_workspaces
 
 logger = logging.getLogger(__name__)
 
-RECOVERY_TIMEOUT_SECONDS = 60.0
-"""Looking for lost jobs is begun again after this time, so that nothing that hangs keeps them waiting."""
-SWEEP_SECONDS = 60.0
-STORE_SWEEP_SECONDS = 3600.0
-THIN_EVENTS_SECONDS = 600.0
-STALE_UPLOAD_SECONDS = 86_400.0
 SPACE_CHECK_SECONDS = 5.0
-WORKERS_BACK_SECONDS = 600.0
-"""A queue is taken for abandoned when it has been seen without a worker for so long, however old its jobs."""
 DEFERRAL_POLLS = 3
 """A job that is left to workers of another version is kept from all for so many looks at the queue ..."""
 MAX_DEFERRAL_SECONDS = 15.0
@@ -170,10 +156,7 @@ class _Worker:
         self._is_database_lost = False
         self._admission = Admission(name, pool, context)
         self._deferrals: Counter[uuid.UUID] = Counter()
-        # A worker that lives is heard of in between, also where all of this machine stood still.
-        self._stalled = StalledAttempts(1.5 * settings.heartbeat_seconds + settings.poll_seconds)
-        self._abandoned = StalledAttempts(WORKERS_BACK_SECONDS)
-        self._sender = WebhookSender(pool, settings.webhook_hosts)
+        self._housekeeping = Housekeeping(settings, pool, context)
 
     async def run(self) -> int:
         loop = asyncio.get_running_loop()
@@ -187,13 +170,7 @@ class _Worker:
                 PeriodicTask(
                     self._send_heartbeat, settings.heartbeat_seconds, max(60.0, settings.stale_seconds)
                 ),
-                PeriodicTask(self._recover_stalled, settings.rescue_seconds, RECOVERY_TIMEOUT_SECONDS),
-                PeriodicTask(self._sweep_workspaces, SWEEP_SECONDS),
-                PeriodicTask(self._sweep_store, STORE_SWEEP_SECONDS),
-                PeriodicTask(self._send_webhooks, settings.poll_seconds),
-                PeriodicTask(self._delete_expired, SWEEP_SECONDS),
-                PeriodicTask(self._thin_events, THIN_EVENTS_SECONDS),
-                PeriodicTask(self._collect_garbage, settings.collect_seconds),
+                *self._housekeeping.tasks(),
                 PeriodicTask(self._admission.free_space_if_short, SPACE_CHECK_SECONDS),
             )
         ]
@@ -205,7 +182,7 @@ class _Worker:
             for outcome in await cancel_and_wait(periodic):
                 if isinstance(outcome, PeriodicTaskError):
                     logger.error("worker %s ends, as %s", self._name, outcome)
-            await self._sender.close()
+            await self._housekeeping.close()
         if self._is_database_lost:
             return EXIT_DATABASE_LOST
         # Else others would count this worker as live for a while; nothing depends on it.
@@ -376,54 +353,6 @@ class _Worker:
             "cold_start_seconds": round(cold_start_seconds(kernel_groups()), 1) if self._queues else 0.0,
             **version_facts(),
         }
-
-    async def _recover_stalled(self) -> None:
-        await recover_stalled_jobs(
-            self._pool, self._context.job_queue, self._settings.stale_seconds, self._stalled
-        )
-        async with self._pool.connection() as connection:
-            await remove_stale_workers(connection, max(60.0, 3 * self._settings.stale_seconds))
-
-    async def _send_webhooks(self) -> None:
-        await self._sender.start_due()
-
-    async def _delete_expired(self) -> None:
-        """Apply the retention times."""
-        await apply_retention(self._pool, self._settings.retention, self._settings.keep_audit_hours)
-        for job_id in await fail_abandoned_jobs(
-            self._pool,
-            self._context.job_queue,
-            stale_seconds=self._settings.stale_seconds,
-            hours=self._settings.absent_queue_hours,
-            suspects=self._abandoned,
-        ):
-            logger.warning("job %s waited too long in a queue that no worker takes", job_id)
-
-    async def _thin_events(self) -> None:
-        async with self._pool.connection() as connection:
-            await thin_progress_events(connection)
-
-    async def _collect_garbage(self) -> None:
-        try:
-            await collect_garbage(
-                self._pool,
-                self._context.storage,
-                unused_seconds=3600 * self._settings.keep_unused_hours,
-                every_seconds=0.9 * self._settings.collect_seconds,
-            )
-        except StorageError as error:
-            logger.info("unused contents were not collected: %s", error)
-
-    async def _sweep_workspaces(self) -> None:
-        await asyncio.to_thread(sweep_workspaces, self._settings.work_folder)
-        await asyncio.to_thread(sweep_temporary, Path(tempfile.gettempdir()), STALE_UPLOAD_SECONDS)
-
-    async def _sweep_store(self) -> None:
-        """Remove the remains of killed uploads from the storage; no upload takes a day."""
-        try:
-            await asyncio.to_thread(self._context.storage.remove_stale_uploads, STALE_UPLOAD_SECONDS)
-        except StorageError as error:
-            logger.info("the store was not swept: %s", error)
 
 
 def _on_unhandled_exception(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
