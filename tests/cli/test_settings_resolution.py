@@ -22,6 +22,7 @@ from octasplat.service.actions.validation import resolve_options
 from octasplat.service.problems import ProblemError
 from octasplat.workers.cli.main import cli
 from octasplat.workers.worker.job_kinds import get_job_kind
+from octasplat.workers.worker.job_kinds.reconstruct_kinds import ReconstructJobConfig
 
 Outcome = ReconstructionConfig | str
 """What settings mean, or the sentence that refuses them."""
@@ -140,7 +141,7 @@ def by_http(options: Mapping[str, Any]) -> Outcome:
 def _accepted(options: Mapping[str, Any]) -> ReconstructionConfig:
     found = asyncio.run(resolve_options(get_job_kind("reconstruct"), options)).complete
     stored = json.loads(json.dumps(found.model_dump(mode="json")))
-    return ReconstructionConfig.model_validate(stored)
+    return ReconstructJobConfig.model_validate(stored).run_config()
 
 
 def by_python(options: dict[str, Any]) -> Outcome:
@@ -259,11 +260,9 @@ def test_retry_with_materials_adds_their_settings() -> None:
     kind = get_job_kind("reconstruct")
     before = ReconstructOptions(preset="fast", assignments=("rays_per_batch=4096", "seed=7")).config()
     changed = kind.revise(before.model_dump(mode="json"), {"materials": True})
-    assert (
-        changed
-        == ReconstructOptions(
-            preset="fast", materials=True, assignments=("rays_per_batch=4096", "seed=7")
-        ).config()
-    )
+    wanted = ReconstructOptions(
+        preset="fast", materials=True, assignments=("rays_per_batch=4096", "seed=7")
+    ).config()
+    assert changed.run_config() == wanted
     back = kind.revise(changed.model_dump(mode="json"), {"train": {"materials": {"learn": False}}})
-    assert back == before
+    assert back.run_config() == before
