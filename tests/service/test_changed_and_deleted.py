@@ -195,6 +195,7 @@ async def test_event_stream_of_deleted_job_ends(
             stream = asyncio.create_task(http.get(f"/v1/jobs/{job['id']}/events"))
             while not service.event_broker.subscriber_count:
                 await asyncio.sleep(0.02)
+            await asyncio.sleep(1)  # past events are read after the stream is known
             async with service.pool.connection() as connection:
                 await connection.execute("DELETE FROM jobs WHERE id = %s", [uuid.UUID(job["id"])])
             answer = await asyncio.wait_for(stream, 60)

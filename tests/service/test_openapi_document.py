@@ -60,5 +60,5 @@ async def test_lists_of_jobs_leave_the_options_to_each_job(connect_service: Conn
         [listed] = (await http.get("/v1/jobs")).json()["jobs"]
         full = (await http.get(f"/v1/jobs/{listed['id']}")).json()
         assert "options" not in listed and full["options"] == made["options"]
-        assert set(full) - set(listed) == {"options", "requested", "view_notes"}
+        assert set(full) - set(listed) == {"blocks", "options", "requested", "view_notes"}
         assert len(json.dumps(listed)) < len(json.dumps(full)) / 2
