@@ -31,6 +31,7 @@ from octasplat.engine.train.config import McmcConfig, RedisplatsConfig, TrainCon
 from octasplat.service.actions.validation import resolve_options
 from octasplat.workers.cli.main import cli
 from octasplat.workers.worker.job_kinds import get_job_kind
+from octasplat.workers.worker.job_kinds.reconstruct_kinds import ReconstructJobConfig
 
 FORMER = {
     "preset": "paper",
@@ -64,6 +65,13 @@ FORMER_SETS = (
     'densify={"kind": "mcmc", "idle_weight": 0.5}',
 )  # fmt: skip
 EXPECTED = ReconstructOptions.model_validate(NEW).config()
+
+
+def _resolved(options: dict[str, Any]) -> ReconstructionConfig:
+    """Return the settings of the run that a job with such options makes."""
+    complete = asyncio.run(resolve_options(get_job_kind("reconstruct"), options)).complete
+    assert isinstance(complete, ReconstructJobConfig)
+    return complete.run_config()
 
 
 def test_former_python_names_are_read_with_notice() -> None:
@@ -115,7 +123,7 @@ def test_former_submitted_options_are_read_with_notice(monkeypatch: pytest.Monke
 
     def keep(_api: object, what: Any, _printer: object) -> dict[str, str]:
         options = json.loads(json.dumps(what.options))
-        found.append(asyncio.run(resolve_options(get_job_kind("reconstruct"), options)).complete)
+        found.append(_resolved(options))
         return {"id": "1"}
 
     monkeypatch.setattr("octasplat.workers.cli.remote_jobs.submit", keep)
@@ -131,13 +139,13 @@ def test_former_submitted_options_are_read_with_notice(monkeypatch: pytest.Monke
 def test_former_names_in_the_options_of_a_job_mean_the_same() -> None:
     kind = get_job_kind("reconstruct")
     with collect_notices() as notices:
-        assert asyncio.run(resolve_options(kind, FORMER)).complete == EXPECTED
+        assert _resolved(FORMER) == EXPECTED
     assert notices
     stored = EXPECTED.model_dump(mode="json")
     stored |= {"evaluate_background": stored.pop("evaluation_background"), "preset": "paper"}
     stored["train"] = dump_with_former_settings(EXPECTED.train)
     with pytest.warns(RenamedSettingWarning):
-        assert kind.options.model_validate(stored) == EXPECTED
+        assert kind.options.model_validate(stored).run_config() == EXPECTED
     with pytest.warns(RenamedSettingWarning):
         assert kind.revise(stored, {"train": {"rates": {"quat": 0.5}}}).train.lr.quat == 0.5
 

@@ -14,6 +14,7 @@ from PIL import Image
 from octasplat.engine.core.errors import OctasplatError
 from octasplat.engine.core.events import Event, Warned
 from octasplat.engine.dataset import Dataset
+from octasplat.engine.dataset.colmap_model import read_colmap_model
 from octasplat.engine.dataset.model_sources import has_model
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.operations.estimate import EstimateRequest
@@ -115,8 +116,15 @@ def as_text(encoding: str, ending: str = "\n") -> Mutation:
         for folder in scene.rglob("0"):
             if (folder / "cameras.bin").exists():
                 try:
+                    # of a damaged count COLMAP takes all memory
+                    read_colmap_model(folder)
                     pycolmap.Reconstruction(str(folder)).write_text(str(folder))
-                except (RuntimeError, ValueError, IndexError):  # another mutation was here before
+                except (
+                    OctasplatError,
+                    RuntimeError,
+                    ValueError,
+                    IndexError,
+                ):  # one was before
                     continue
                 for path in folder.glob("*.bin"):
                     path.unlink()

@@ -18,7 +18,8 @@ from octasplat.engine.trace.cpu.kernels.spherical_harmonics import eval_sh_basis
 def run_python(code: str, **environment: str) -> str:
     done = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(code)],
-        env={**os.environ, **environment},
+        # Python's own cache goes by time stamps, which do not always tell here
+        env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1", **environment},
         capture_output=True,
         text=True,
         check=True,
