@@ -22,7 +22,7 @@ from octasplat.workers.worker.workspace_locks import LOCK_FILE, sweep_workspaces
 
 
 def make_workspace(folder: Path) -> Workspace:
-    job: Any = SimpleNamespace(id=uuid.uuid4(), attempt=1, kind="unknown", options={})
+    job: Any = SimpleNamespace(id=uuid.uuid4(), attempt=1, kind="unknown", options={}, role=None)
     return Workspace(folder / "work", job, LocalStorage(folder / "store", floor_bytes=0))
 
 
