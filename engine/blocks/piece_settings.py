@@ -2,9 +2,13 @@
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.train.config import McmcConfig, TrainConfig, uses_shared_sort
+
+if TYPE_CHECKING:
+    from octasplat.engine.runs.config import ReconstructionConfig
 
 COARSE_ITERATIONS, COARSE_GAUSSIANS = 2_500, 50_000
 """Most of the coarse scene, as of the preset fast."""
@@ -30,18 +34,19 @@ FINISH_AVERAGING_START = 0.5
 """Share of them after which states are averaged."""
 
 
-def require_blocks_possible(config: TrainConfig, *, has_time_budget: bool) -> None:
+def require_blocks_possible(config: "ReconstructionConfig") -> None:
     """Refuse settings with which a scene is not trained in blocks.
 
     Raises:
         ConfigError: one of them is on.
     """
     unsupported = {
-        "materials": config.materials.learn,
-        "refine_poses": config.refine_poses,
-        "exclude_outlier_views": config.exclude_outlier_views,
-        "loss.free_space": config.loss.free_space > 0,
-        "a time budget (--minutes)": has_time_budget,
+        "materials": config.train.materials.learn,
+        "refine_poses": config.train.refine_poses,
+        "exclude_outlier_views": config.train.exclude_outlier_views,
+        "loss.free_space": config.train.loss.free_space > 0,
+        "a time budget (--minutes)": config.minutes is not None,
+        "a region (--region)": config.region is not None,
     }
     if found := [name for name, is_on in unsupported.items() if is_on]:
         raise ConfigError(

@@ -22,12 +22,11 @@ from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.edit.axes import Axes
 from octasplat.engine.edit.filter_expression import MAX_LENGTH, parse_filter
 from octasplat.engine.gaussians.materials import MATERIAL_WIDTHS
-from octasplat.engine.settings.fields import Group, Spelling, Unit
+from octasplat.engine.settings.fields import BoxCorners, Group, Spelling, Unit
 
 _HEX = re.compile(r"#([0-9a-fA-F]{6})")
 
 
-_Box = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 _Sphere = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 
 
@@ -42,7 +41,7 @@ class Selection(BaseModel):
         description="Comparisons joined by and, or, not that hold for them, of x, y, z, opacity and channels "
         "such as metallic, roughness and albedo.r: 'metallic > 0.5 and z < 0'.",
     )
-    box: Annotated[_Box | None, Spelling(metavar="X0 Y0 Z0 X1 Y1 Z1")] = Field(
+    box: Annotated[BoxCorners | None, Spelling(metavar="X0 Y0 Z0 X1 Y1 Z1")] = Field(
         None,
         description="Two corners of a box that their centres lie in, smallest coordinates first.",
     )

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.local_origin import NO_ORIGIN, Origin
+from octasplat.engine.dataset.region import Region
 from octasplat.engine.edit.axes import infer_q
 from octasplat.engine.edit.edit_options import Selection
 from octasplat.engine.edit.filter_expression import filter_mask
@@ -52,9 +53,8 @@ def in_box(
     low, high = np.asarray(low_world, np.float64), np.asarray(high_world, np.float64)
     if not (low <= high).all():
         raise ConfigError("A box needs its smallest x, y, z first and then its largest ones.")
-    means = gaussians.means_world
-    result: np.ndarray = np.logical_and.reduce((means >= low) & (means <= high), axis=1)
-    return result
+    x0, y0, z0, x1, y1, z1 = np.concatenate([low, high]).tolist()
+    return Region((x0, y0, z0, x1, y1, z1)).contains(gaussians.means_world)
 
 
 def in_sphere(

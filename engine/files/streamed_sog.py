@@ -71,7 +71,13 @@ def _former_chunks(path: Path) -> frozenset[str]:
         found = {match[1] for name in names if (match := _CHUNK_META.fullmatch(name))}
     except (OSError, ValueError, KeyError, TypeError):
         return frozenset()
-    return frozenset(name for name in found if (path.parent / name / META_FILE).is_file())
+    return frozenset(name for name in found if _holds_a_chunk_alone(path.parent / name))
+
+
+def _holds_a_chunk_alone(folder: Path) -> bool:
+    """Return whether a folder holds the files of a chunk, and nothing that somebody put there."""
+    names = {file.name for file in folder.iterdir()} if folder.is_dir() else set()
+    return META_FILE in names and all(name == META_FILE or name.endswith(".webp") for name in names)
 
 
 def _move_into_place(index: Path, path: Path, former: frozenset[str]) -> tuple[Path, ...]:

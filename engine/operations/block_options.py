@@ -52,9 +52,7 @@ def check_block_options(options: BlockOptions, config: "ReconstructionConfig") -
             raise ConfigError("--memory is that of a block; say --blocks auto, too.")
         name = "blocks"
         if isinstance(options.blocks, int) and options.blocks > 1:  # an automatic number is known later
-            if config.region is not None:
-                raise ConfigError("A region is trained in one piece: leave out --region or --blocks.")
-            require_blocks_possible(config.train, has_time_budget=config.minutes is not None)
+            require_blocks_possible(config)
     except ConfigError as error:
         raise InvalidSettingsError([Refusal((name,), "blocks", str(error))]) from None
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 
-from octasplat.engine.core.events import EventListener, Warned, ignore_events
+from octasplat.engine.core.events import EventListener, Noted, Warned, ignore_events
 from octasplat.engine.core.threads import available_threads
 from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.base import Operation, Request, Result, never_stop
@@ -100,6 +100,8 @@ def run(
     scene = locate_scene(request.source)
     for sentence in notes_on_files(scene):
         progress(Warned(sentence))
+    if config.region is not None:
+        progress(Noted("The estimate is of the whole scene; the training of a region takes less."))
     sizes = photograph_sizes(scene)
     found = estimate_scene(scene, config, sizes, cores)
     return EstimateResult(photographs=tuple(sizes), **found.model_dump())

@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
@@ -165,8 +165,20 @@ class ExportResult(Result):
     """Result of an export: the files that were written."""
 
     def lines(self) -> tuple[str, ...]:
-        """Return the files with their sizes."""
-        return tuple(f"Wrote {path} ({path.stat().st_size / 1e6:.1f} MB)." for path in self.files)
+        """Return the files with their sizes; those in folders beside a file are counted with it."""
+        groups: list[list[Path]] = []
+        for path in self.files:
+            if groups and groups[-1][0].parent in path.parent.parents:
+                groups[-1].append(path)
+            else:
+                groups.append([path])
+        return tuple(map(_written_sentence, groups))
+
+
+def _written_sentence(paths: Sequence[Path]) -> str:
+    first, *beside = paths
+    size = f"{sum(path.stat().st_size for path in paths) / 1e6:.1f} MB"
+    return f"Wrote {first} ({size}{f' with {len(beside)} files in folders beside it' if beside else ''})."
 
 
 def run(

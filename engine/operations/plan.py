@@ -180,7 +180,7 @@ def _costs(
         )
         figures = {"seconds": whole.seconds, "memory_bytes": whole.memory_bytes}
         return {"blocks": (only,), "coarse_seconds": 0.0, **figures}
-    require_blocks_possible(config.train, has_time_budget=config.minutes is not None)
+    require_blocks_possible(config)
     longest = max(max(view.width_px, view.height_px) for view in model.views)
     smaller = given.model_copy(
         update={"train": coarse_settings(config.train), "max_side": coarse_side_px(longest)}

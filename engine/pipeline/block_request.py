@@ -48,9 +48,7 @@ class BlockRequest(BaseModel):
             valid = valid_pixel_fraction(dataset) if self.most_gaussians is not None else 1.0
             count = self.fewest(config.train, len(dataset.train_indices), dataset.train_pixel_count, valid)
         if count > 1:
-            if config.region is not None:
-                raise ConfigError("A region is trained in one piece: leave out --region or --blocks.")
-            require_blocks_possible(config.train, has_time_budget=config.minutes is not None)
+            require_blocks_possible(config)
         return count
 
     def fewest(

@@ -80,7 +80,7 @@ def reconstruct(
             "A scene that is trained in blocks begins anew; leave --blocks or --start-from out."
         )
     if blocks is not None and (blocks.count or 1) > 1:  # of an automatic number it is known later
-        require_blocks_possible(config.train, has_time_budget=config.minutes is not None)
+        require_blocks_possible(config)
     use_threads(threads)
     # before the claim, which makes the folder
     is_made, is_new = not output.exists(), claim_output(scene, output, config, resume)

@@ -41,7 +41,8 @@ def propose_pairs(database: Path, small: Path, count: int, *, seed: int, threads
     """
     found = neighbor_pairs(count, NEIGHBORS_BY_NAME)
     with pycolmap.Database.open(database) as photographs:
-        by_gps = photographs.num_pose_priors() >= MIN_GPS_SHARE * count
+        located = sum(prior.has_position() for prior in photographs.read_all_pose_priors())
+        by_gps = located >= MIN_GPS_SHARE * count
         if by_gps:
             found |= _nearest_by_gps(photographs, threads)
     if not by_gps:

@@ -3,16 +3,13 @@
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from octasplat.engine.runs.export_names import ExportNames
 from octasplat.engine.runs.result_files import DEFAULT_EXPORTS
 from octasplat.engine.settings import renamed_settings
-from octasplat.engine.settings.fields import ADVANCED, BASIC, Spelling, Unit
+from octasplat.engine.settings.fields import ADVANCED, BASIC, BoxCorners, Spelling, Unit
 from octasplat.engine.settings.preset_names import PRESET_WORDS, PresetName
-
-Box = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
-"""Two corners of a box along the axes, smallest coordinates first."""
 
 
 class RunSettings(BaseModel):
@@ -97,10 +94,12 @@ class RunSettings(BaseModel):
         description="Two points and the metres between them, which decide the scale; a point is a control "
         "point, a photograph, the number of a sparse point, or x,y,z.",
     )
-    region: Annotated[Box | None, Unit("world"), Spelling(metavar="X0 Y0 Z0 X1 Y1 Z1"), ADVANCED] = Field(
-        None,
-        description="Two corners of a box to train in detail, smallest coordinates first, in the coordinates "
-        "of the COLMAP model; what lies around stays coarse. By default all of the scene is trained alike.",
+    region: Annotated[BoxCorners | None, Unit("world"), Spelling(metavar="X0 Y0 Z0 X1 Y1 Z1"), ADVANCED] = (
+        Field(
+            None,
+            description="Two corners of a box to train in detail, smallest coordinates first, in the coordinates "
+            "of the COLMAP model; what lies around stays coarse. By default all of the scene is trained alike.",
+        )
     )
     minutes: Annotated[float | None, Unit("minutes"), BASIC] = Field(
         None,
@@ -117,7 +116,7 @@ class RunSettings(BaseModel):
 
     @field_validator("region")
     @classmethod
-    def _has_a_volume(cls, box: Box | None) -> Box | None:
+    def _has_a_volume(cls, box: BoxCorners | None) -> BoxCorners | None:
         if box is not None and any(low >= high for low, high in zip(box[:3], box[3:], strict=True)):
             raise ValueError("a region needs its smallest x, y, z first and then its largest ones")
         return box

@@ -30,8 +30,6 @@ class Settings(BaseModel):
 
     former_settings: ClassVar[Mapping[str, FormerSetting]] = {}
     former_names: ClassVar[FormerNames] = NONE
-    added_settings: ClassVar[frozenset[str]] = frozenset()
-    """Settings that runs of the last version do not know; at their defaults digests leave them out."""
 
     @model_validator(mode="before")
     @classmethod
@@ -66,16 +64,13 @@ def json_by_former_names(settings: Settings) -> str:
 def dump_with_former_settings(settings: Settings) -> dict[str, Any]:
     """Return the settings as JSON values, by former names, with the former ones where these were written.
 
-    Digests of settings stay valid by this when a setting is renamed, becomes a constant, or is new and has
-    its default.
+    Digests of settings stay valid by this when a setting is renamed or becomes a constant.
     """
     dumped: dict[str, Any] = {}
     names = former_names(type(settings))
     former_name = {new: old for old, new in names.fields.items()}
     for name, value in settings.model_dump(mode="json").items():
         inner = getattr(settings, name)
-        if name in settings.added_settings and inner == type(settings).model_fields[name].default:
-            continue
         former_value = {new: old for old, new in names.values.get(name, {}).items()}
         if isinstance(inner, Settings):
             # nested models have former names of their own

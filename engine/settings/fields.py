@@ -6,7 +6,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
 
-from pydantic import BaseModel, GetJsonSchemaHandler
+from pydantic import BaseModel, FiniteFloat, GetJsonSchemaHandler
 from pydantic.fields import FieldInfo
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
@@ -127,6 +127,8 @@ class NamedFile(_InSchema):
         return {"format": "octasplat-file"}
 
 
+BoxCorners = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
+"""Two corners of a box along the axes, smallest coordinates first."""
 InputFile = Annotated[Path, NamedFile()]
 """A file that options name: a path here, a name among the job's files in a service."""
 Source = Annotated[Path, Positional("IN"), ReadPath()]

@@ -172,6 +172,13 @@ def test_levels_of_detail_are_written_through_it(
     again = export_scene(scene.select(slice(0, 90)), index)  # fewer levels: nothing of before is left
     assert json.loads(index.read_text())["counts"] == [90] and set(again) < {index, *chunks}
     assert sorted(path.name for path in index.parent.iterdir()) == ["0_0", "lod-meta.json"]
+    (tmp_path / "out" / "0_0" / "mine.txt").write_text("kept")
+    with pytest.raises(SceneFileError, match="0_0 is there already and no part of it"):
+        export_scene(scene, index)
+    assert (tmp_path / "out" / "0_0" / "mine.txt").exists() and json.loads(index.read_text())["counts"] == [
+        90
+    ]
+    (tmp_path / "out" / "0_0" / "mine.txt").unlink()
     shutil.move(index, tmp_path / "out" / "other.json")
     with pytest.raises(SceneFileError, match="0_0 is there already and no part of it"):
         export_scene(scene, index)

@@ -229,22 +229,6 @@ def test_adam_regulariser_lowers_its_parameter(term: str) -> None:
             assert (difference < 0).all() if name == changed else not difference.any()
 
 
-def test_decay_takes_a_share_of_harmonics_by_degree() -> None:
-    ours, plain = gaussians(6, degree=2), gaussians(6, degree=2)
-    ids = np.array([1, 4])
-    rates = LearningRates(sh_decay=0.1, decay=0.25)
-    given = gradients(ours, ids, np.random.default_rng(2))
-    for these, lr in ((ours, rates), (plain, rates.model_copy(update={"sh_decay": 0.0}))):
-        Adam.zeros(these).step(these, given, lr, NO_LOSS, training_progress=0.5, extent=1.0)
-    # half of the rate is left in the middle of the training: 0.05 for each degree
-    kept = np.array([1.0, *[0.95] * 3, *[0.9] * 5], np.float32)[:, None]
-    np.testing.assert_allclose(ours.sh[ids], plain.sh[ids] * kept, rtol=1e-6)
-    others = np.array([0, 2, 3, 5])
-    np.testing.assert_array_equal(ours.sh[others], gaussians(6, degree=2).sh[others])
-    for name in NAMES[:-1]:
-        np.testing.assert_array_equal(getattr(ours, name), getattr(plain, name))
-
-
 def test_select_append_reset_widen() -> None:
     ours = gaussians(6, degree=0)
     adam = Adam.zeros(ours)

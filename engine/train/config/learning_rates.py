@@ -18,7 +18,6 @@ class LearningRates(Settings):
     """
 
     former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.LEARNING_RATES
-    added_settings: ClassVar = frozenset({"sh_decay"})
 
     mean: Annotated[float, Unit("mean_unit"), ADVANCED] = Field(
         0.14,
@@ -71,14 +70,6 @@ class LearningRates(Settings):
         ge=0,
         description="Step of the higher harmonics, of the constant one's. Lower it where colors flicker "
         "between views.",
-    )
-    sh_decay: Annotated[float, Unit("share"), EXPERIMENTAL] = Field(
-        0.0,
-        ge=0,
-        le=0.3,
-        description="Share of its value that each step takes from a higher harmonic of a Gaussian that is "
-        "seen, times its degree, so that colors change with the direction only where photographs say so. "
-        "Try 0.002 for single things with many photographs around them; 0 takes nothing.",
     )
     exposure: Annotated[float, Unit("log gain"), ADVANCED] = Field(
         2e-3,

@@ -18,7 +18,7 @@ def make_densifier(
 ) -> Densifier:
     """Return the strategy that ``config`` describes, for so many iterations and at most so many Gaussians.
 
-    The places of the published strategy are chosen by gradients, which a region makes larger by itself.
+    The strategy of the paper takes no note of a region.
     """
     if isinstance(config, McmcConfig):
         return McmcDensifier(config, iterations=iterations, max_gaussians=max_gaussians, region=region)

@@ -321,22 +321,6 @@ def adam_step(
 
 
 @kernel()
-def shrink_harmonics(
-    first_row: int,
-    last_row: int,
-    ids: Int32[np.ndarray, " u"],
-    sh: Float32[np.ndarray, "n k 3"],
-    kept: Float32[np.ndarray, " k"],
-) -> None:
-    """Multiply the harmonics of the Gaussians ``ids`` by what is kept of each."""
-    for row in range(first_row, last_row):
-        i = ids[row]
-        for place in range(1, sh.shape[1]):
-            for channel in range(3):
-                sh[i, place, channel] *= kept[place]
-
-
-@kernel()
 def adam_shares(
     first_row: int,
     last_row: int,

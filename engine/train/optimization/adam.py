@@ -27,7 +27,6 @@ from octasplat.engine.train.kernels.adam import (
     StepRates,
     adam_shares,
     adam_step,
-    shrink_harmonics,
 )
 from octasplat.engine.train.kernels.adam_lanes import LANES
 
@@ -161,10 +160,6 @@ class Adam:
             ),
             grain=1,
         )
-        if rates.sh_decay > 0 and gaussians.sh_degree > 0:
-            kept = _harmonics_kept(gaussians.sh.shape[1], rates.sh_decay * decay)
-            ids = gradients.ids
-            run_ranges(shrink_harmonics, threads_in_use(), len(ids), ids, gaussians.sh, kept)
         self._step_channels(gaussians, gradients, rates, decay, corrections)
         return mean_steps
 
@@ -189,12 +184,6 @@ class Adam:
                     column, values, gradients.features[:, column : column + width], rate * decay,
                 )  # fmt: skip
             column += width
-
-
-def _harmonics_kept(basis_count: int, share: float) -> Float32[np.ndarray, " k"]:
-    """Return what a step keeps of each harmonic: one less ``share`` times its degree, 0 at least."""
-    degrees = np.sqrt(np.arange(basis_count)).astype(np.int64)
-    return np.maximum(1.0 - share * degrees, 0.0).astype(np.float32)
 
 
 @cache
