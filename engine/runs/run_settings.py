@@ -97,8 +97,9 @@ class RunSettings(BaseModel):
     region: Annotated[BoxCorners | None, Unit("world"), Spelling(metavar="X0 Y0 Z0 X1 Y1 Z1"), ADVANCED] = (
         Field(
             None,
-            description="Two corners of a box to train in detail, smallest coordinates first, in the coordinates "
-            "of the COLMAP model; what lies around stays coarse. By default all of the scene is trained alike.",
+            description="Two corners of a box to train in detail, smallest coordinates first, in the "
+            "coordinates of the COLMAP model; what lies around stays coarse. By default all of the scene is "
+            "trained alike.",
         )
     )
     minutes: Annotated[float | None, Unit("minutes"), BASIC] = Field(
