@@ -24,7 +24,7 @@ from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import Tracer
-from octasplat.engine.train.config import TrainConfig, iteration_count
+from octasplat.engine.train.config import TrainConfig, iteration_count, min_tile_side_px
 from octasplat.engine.train.loop.checkpoint import BestState, load_best
 from octasplat.engine.train.loop.state import TrainState, initial_state
 from octasplat.engine.train.sampling.batches import evaluation_background
@@ -150,11 +150,6 @@ def _final_shading(work: BlockWork, scene: BestState) -> ShadingModel:
 def polish_iterations(config: TrainConfig, pixels: int, valid_fraction: float) -> int:
     """Return the iterations of the polish of so many pixels, of which a share shows anything."""
     return max(1, round(POLISH_FRACTION * iteration_count(config, pixels, valid_fraction)))
-
-
-def min_tile_side_px(config: TrainConfig) -> int:
-    """Return the least side of a tile: patches for SSIM fit into it."""
-    return config.ssim_patch_side if config.loss.ssim > 0 else 1
 
 
 def make_piece_tracer(work: BlockWork) -> Tracer:

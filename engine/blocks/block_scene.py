@@ -11,7 +11,6 @@ from octasplat.engine.blocks.block_merge import (
     BlockScene,
     finish_scene,
     make_piece_tracer,
-    min_tile_side_px,
     polish_iterations,
     stop_when_asked,
 )
@@ -30,7 +29,12 @@ from octasplat.engine.core.events import Noted
 from octasplat.engine.core.threads import use_threads
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.dataset.view_tiles import Rectangles
-from octasplat.engine.train.config import TrainConfig, iteration_count, max_gaussian_count
+from octasplat.engine.train.config import (
+    TrainConfig,
+    iteration_count,
+    max_gaussian_count,
+    min_tile_side_px,
+)
 from octasplat.engine.train.initialization.initial_gaussians import initial_train_state
 from octasplat.engine.train.loop.checkpoint import BestState, load_best
 from octasplat.engine.train.loop.state import TrainState, initial_state

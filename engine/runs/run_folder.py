@@ -20,6 +20,7 @@ from octasplat.engine.dataset.views_file import SplitViewpoints, ViewsRecord, re
 from octasplat.engine.files import read_metadata
 from octasplat.engine.runs.config import ReconstructionConfig, read_config
 from octasplat.engine.shading.exposure import ExposuresByName
+from octasplat.engine.train.config import min_tile_side_px
 
 CONFIG, EVENTS, HELD_OUT, SCENE, TRAINING, VIEWS = (
     "config.json", "events.jsonl", "held_out.json", "scene.ply", "training.json", "views.json",
@@ -210,8 +211,7 @@ def found_model_folder(output: Path) -> Path | None:
 def _region(config: ReconstructionConfig) -> Region | None:
     if config.region is None:
         return None
-    # patches for SSIM fit into tiles
-    return Region(config.region, config.train.ssim_patch_side if config.train.loss.ssim > 0 else 1)
+    return Region(config.region, min_tile_side_px(config.train))
 
 
 def open_run_dataset(

@@ -91,6 +91,11 @@ def ray_patch_side_px(config: TrainConfig, longest_side_px: int, pixels_per_gaus
     return min(widest, max(1, round(math.sqrt(PATCH_PIXELS_PER_GAUSSIAN_PIXEL * pixels_per_gaussian))))
 
 
+def min_tile_side_px(config: TrainConfig) -> int:
+    """Return the least side of tiles of pixels that are drawn from: patches for SSIM fit into them."""
+    return config.ssim_patch_side if config.loss.ssim > 0 else 1
+
+
 def rebuild_interval(rebuild_every: int, gaussians: int) -> int:
     """Return the iterations between rebuilds: ``rebuild_every``, as much again for each half million.
 
