@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
-from jaxtyping import Bool, Float32, Int32, UInt8
+from jaxtyping import Bool, Float32, Int32, UInt8, UInt16
 
 from octasplat.engine.core.errors import OutputError
 
@@ -28,6 +28,11 @@ def _write_image(path: Path, pixels: np.ndarray, kind: str, channels: tuple[str,
     written = output.write_image(np.ascontiguousarray(pixels.reshape(height, width, len(channels))))
     if not (output.close() and written):
         raise OutputError(f"{path} cannot be written: {output.geterror()}.")
+
+
+def write_channels(path: Path, pixels: UInt8[np.ndarray, "h w c"] | UInt16[np.ndarray, "h w c"]) -> None:
+    """Write a PNG of one or three channels as they are, with 8 or 16 bits."""
+    _write_image(path, pixels, pixels.dtype.name, ("R", "G", "B") if pixels.shape[2] == 3 else ("Y",))
 
 
 def write_photograph(path: Path, pixels: UInt8[np.ndarray, "height width channels"]) -> None:

@@ -136,7 +136,7 @@ def surface_of_revolution(profile: Float[np.ndarray, "k 2"], columns: int) -> Te
     return grid_surface(points, uv)
 
 
-def catmull_rom_profile(knots: Float[np.ndarray, "k 2"], steps: int) -> Float[np.ndarray, "q 2"]:
+def catmull_rom_curve(knots: Float[np.ndarray, "k d"], steps: int) -> Float[np.ndarray, "q d"]:
     """Return a Catmull-Rom curve through ``knots`` with ``steps`` points for each segment."""
     padded = np.concatenate([2 * knots[:1] - knots[1:2], knots, 2 * knots[-1:] - knots[-2:-1]])
     t = np.linspace(0, 1, steps, endpoint=False)[:, None]
@@ -144,7 +144,12 @@ def catmull_rom_profile(knots: Float[np.ndarray, "k 2"], steps: int) -> Float[np
         0.5 * (2 * b + (c - a) * t + (2 * a - 5 * b + 4 * c - d) * t**2 + (3 * b - a - 3 * c + d) * t**3)
         for a, b, c, d in zip(padded, padded[1:], padded[2:], padded[3:], strict=False)
     ]
-    curve = np.concatenate([*pieces, knots[-1:]])
+    return np.concatenate([*pieces, knots[-1:]])
+
+
+def catmull_rom_profile(knots: Float[np.ndarray, "k 2"], steps: int) -> Float[np.ndarray, "q 2"]:
+    """Return the curve of :func:`catmull_rom_curve` as a profile of a surface of revolution."""
+    curve = catmull_rom_curve(knots, steps)
     # The spline may swing past the axis.
     curve[:, 0] = np.maximum(curve[:, 0], 0)
     return curve
