@@ -98,7 +98,8 @@ class _MaterialReader:
             transmission=float(extensions.get("transmission", {}).get("transmissionFactor", 0.0)),
             ior=float(extensions.get("ior", {}).get("ior", 1.5)),
             absorption=self._absorption_coefficients(),
-            unsupported=self._unsupported_features(),
+            **self._opacity(base[3], images.get("texture")),
+            unsupported=self._unsupported_features(number),
             **images,  # type: ignore[arg-type]
         )
 
@@ -114,7 +115,29 @@ class _MaterialReader:
         red, green, blue = (-math.log(min(max(share, 1e-6), 1.0)) / distance for share in left)
         return red, green, blue
 
-    def _unsupported_features(self) -> tuple[str, ...]:
+    def _alpha_mode(self) -> str:
+        return str(self._material.get("alphaMode", "OPAQUE"))
+
+    def _opacity(self, factor: float, texture: FileImage | None) -> dict[str, Any]:
+        """Return what of a :class:`MeshMaterial` says where the surface is, by its alpha."""
+        mode = self._alpha_mode()
+        if mode not in ("MASK", "BLEND"):
+            return {}
+        cutoff = float(self._material.get("alphaCutoff", 0.5)) if mode == "MASK" else None
+        return {"opacity": factor, "opacity_texture": texture, "opacity_cutoff": cutoff}
+
+    def _has_vertex_alpha(self, number: int) -> bool:
+        """Return whether some vertices with this material have colors with an alpha below 1."""
+        for mesh in self._file.document.get("meshes", []):
+            for primitive in mesh.get("primitives", []):
+                color = primitive.get("attributes", {}).get("COLOR_0")
+                if primitive.get("material") == number and color is not None:
+                    values = self._file.array(color, np.float32)
+                    if values.shape[1] == 4 and (values[:, 3] < 1.0).any():
+                        return True
+        return False
+
+    def _unsupported_features(self, number: int) -> tuple[str, ...]:
         """Return what is not understood, in words."""
         material = self._material
         found = [
@@ -122,9 +145,11 @@ class _MaterialReader:
             for name in self._extensions
             if name not in SUPPORTED_EXTENSIONS
         ]
-        mode = material.get("alphaMode", "OPAQUE")
-        if mode != "OPAQUE":
+        mode = self._alpha_mode()
+        if mode not in ("OPAQUE", "MASK", "BLEND"):
             found.append(f"alphaMode {mode}")
+        if mode in ("MASK", "BLEND") and self._has_vertex_alpha(number):
+            found.append("the alpha of vertices")
         if "occlusionTexture" in material:
             found.append("occlusionTexture")
         for values in self._extensions.values():

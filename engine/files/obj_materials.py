@@ -15,7 +15,9 @@ from octasplat.engine.geometry.mesh_material import MeshMaterial, resolve_image
 MAX_BYTES = 64 << 20
 NUMBERS = {"Ns", "Ni", "d", "Tr", "Pr", "Pm", "illum"}
 COLORS = {"Kd", "Ke"}
-IMAGES = {"map_Kd": "texture", "map_Ke": "emission_texture", "norm": "normal_texture"}
+IMAGES = {
+    "map_Kd": "texture", "map_Ke": "emission_texture", "norm": "normal_texture", "map_d": "opacity_texture",
+}  # fmt: skip
 IGNORED_KEYS = {"Ka", "Ks", "Tf", "Ns", "newmtl", "map_Ka", "map_Ks"}
 """What older programs write into every file, and what has no counterpart."""
 GLASS_ILLUM_MODELS = (4, 6, 7, 9)
@@ -76,8 +78,6 @@ def _parse_material(path: Path, entry: dict[str, str]) -> MeshMaterial:
     clear = int(numbers.get("illum", 0)) in GLASS_ILLUM_MODELS and ("Ni" in numbers or opacity < 1.0)
     known = NUMBERS | COLORS | set(IMAGES) | IGNORED_KEYS
     passed_over = [key for key in entry if key not in known]
-    if opacity < 1.0 and not clear:
-        passed_over.append(f"opacity {opacity:g}")
     return MeshMaterial(
         entry["newmtl"],
         colors.get("Kd", (0.6, 0.6, 0.6)),
@@ -86,6 +86,7 @@ def _parse_material(path: Path, entry: dict[str, str]) -> MeshMaterial:
         emission_linear=colors.get("Ke", (0.0, 0.0, 0.0)),
         transmission=float(clear),
         ior=numbers.get("Ni", 1.5) if numbers.get("Ni", 1.5) >= 1.0 else 1.5,
+        opacity=1.0 if clear else min(max(opacity, 0.0), 1.0),
         unsupported=tuple(passed_over),
         **found,
     )

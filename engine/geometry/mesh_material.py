@@ -41,6 +41,9 @@ class MeshMaterial:
         transmission: share of the light that goes through instead of being scattered by the ground.
         ior: index of refraction.
         absorption: of what lies inside, in each linear channel, per unit of the file.
+        opacity: share of the surface that is there.
+        opacity_texture: alpha, multiplied by it; of an image other than ``texture`` that has none its grey.
+        opacity_cutoff: the surface is there where the opacity reaches this; None where it covers in part.
         unsupported: what else the file says of it, which is not understood, in words.
     """
 
@@ -57,6 +60,9 @@ class MeshMaterial:
     transmission: float = 0.0
     ior: float = 1.5
     absorption: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    opacity: float = 1.0
+    opacity_texture: FileImage | None = None
+    opacity_cutoff: float | None = None
     unsupported: tuple[str, ...] = ()
 
 

@@ -54,9 +54,10 @@ class CompiledMeshes:
     Attributes:
         surfaces: all triangles, those of visible lights included.
         triangles: what rays are sent through.
-        obstacles: the same without glass; None where there is no glass.
-        glass: glass alone, its faces in the order of ``glass_faces``.
-        glass_faces: rows in the surfaces.
+        covers: those without holes; None where none has any.
+        obstacles: those without holes that are not of glass; None where all are.
+        filters: those that are not obstacles, in the order of ``filter_faces``.
+        filter_faces: rows in the surfaces.
         materials: of the triangles.
         lights: of the stage, with the meshes that shine; the environment is the last of them.
         environment_visible: whether the camera sees the environment.
@@ -67,20 +68,23 @@ class CompiledMeshes:
     materials: MaterialArrays
     lights: LightArrays
     environment_visible: bool
+    covers: TriangleBvh | None = None
     obstacles: TriangleBvh | None = None
-    glass: TriangleBvh | None = None
-    glass_faces: Int64[np.ndarray, " g"] | None = None
+    filters: TriangleBvh | None = None
+    filter_faces: Int64[np.ndarray, " g"] | None = None
 
     @property
     def queries(self) -> MeshQueries:
         """Return the kernels' Embree queries; valid while this object lives."""
-        if self.obstacles is None or self.glass is None or self.glass_faces is None:
+        if self.obstacles is None or self.filters is None or self.filter_faces is None:
             every = self.triangles.any_query
-            no_glass = self.triangles.closest_query._replace(scene=0)
-            return MeshQueries(self.triangles.closest_query, every, every, no_glass, np.empty(0, np.int64))
+            nothing = self.triangles.closest_query._replace(scene=0)
+            return MeshQueries(
+                self.triangles.closest_query, every, every, nothing, np.empty(0, np.int64), False
+            )
         return MeshQueries(
-            self.triangles.closest_query, self.triangles.any_query, self.obstacles.any_query,
-            self.glass.closest_query, self.glass_faces,
+            self.triangles.closest_query, (self.covers or self.triangles).any_query, self.obstacles.any_query,
+            self.filters.closest_query, self.filter_faces, self.covers is not None,
         )  # fmt: skip
 
     def with_lights(self, lights: LightArrays) -> "CompiledMeshes":
@@ -144,17 +148,19 @@ def compile_meshes(
     )
     points = surfaces.corners_world.reshape(-1, 3)
     faces = np.arange(len(points), dtype=np.int32).reshape(-1, 3)
-    is_glass = materials.kinds[surfaces.material_ids] == GLASS
-    some = bool(is_glass.any())
+    is_cutout = ((materials.opacity_textures >= 0) | (materials.opacities < 1.0))[surfaces.material_ids]
+    is_filter = is_cutout | (materials.kinds[surfaces.material_ids] == GLASS)
+    some = bool(is_filter.any())
     return CompiledMeshes(
         surfaces=surfaces,
         triangles=TriangleBvh(points, faces, threads=threads),
         materials=materials,
         lights=lights,
         environment_visible=stage.environment is not None and stage.environment.visible,
-        obstacles=TriangleBvh(points, faces[~is_glass], threads=threads) if some else None,
-        glass=TriangleBvh(points, faces[is_glass], threads=threads) if some else None,
-        glass_faces=np.flatnonzero(is_glass) if some else None,
+        covers=TriangleBvh(points, faces[~is_cutout], threads=threads) if is_cutout.any() else None,
+        obstacles=TriangleBvh(points, faces[~is_filter], threads=threads) if some else None,
+        filters=TriangleBvh(points, faces[is_filter], threads=threads) if some else None,
+        filter_faces=np.flatnonzero(is_filter) if some else None,
     )
 
 
@@ -240,12 +246,12 @@ def _add_mesh(
             if not area.sum() > 0.0:
                 raise ConfigError(f"{name}: shines, but has no area; give it a surface, or no emission.")
             own = np.flatnonzero(chosen)[area > 0.0]  # triangles without area have no density of samples
-            texture = builder.table.set_emissive(row, builder.light_count + len(builder.emissive))
+            texture, opacity = builder.table.set_emissive(row, builder.light_count + len(builder.emissive))
             radiance = given.material.emission * srgb_to_linear(np.array(given.material.emission_srgb))
             uv = np.zeros((len(own), 3, 2), np.float32)
             if shape.corner_uv is not None:
                 uv = np.nan_to_num(shape.corner_uv[own])
-            builder.emissive.append(EmissiveMesh(corners[own], uv, radiance, texture))
+            builder.emissive.append(EmissiveMesh(corners[own], uv, radiance, texture, opacity))
     builder.add(corners, normals, rows, shape.corner_uv, shape.corner_rgb_linear)
 
 

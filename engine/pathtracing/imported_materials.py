@@ -42,7 +42,11 @@ def import_material(
     Raises:
         ConfigError: a number is not finite or out of range.
     """
-    numbers = (*source.rgb_linear, *source.emission_linear, source.metallic, source.roughness, source.ior)
+    cutoff = source.opacity_cutoff
+    numbers = (
+        *source.rgb_linear, *source.emission_linear, source.metallic, source.roughness, source.ior,
+        source.opacity, 0.0 if cutoff is None else cutoff,
+    )  # fmt: skip
     if not (np.isfinite(numbers).all() and min(numbers) >= 0.0):
         raise ConfigError(f"the material {source.name} holds a number that is negative or not finite.")
     left_out = list(source.unsupported)
@@ -51,6 +55,8 @@ def import_material(
     if source.transmission >= 0.5:
         named = {"texture": source.texture, "normal texture": source.normal_texture}
         left_out += [f"{key} on glass" for key, image in named.items() if image is not None]
+        if source.opacity < 1.0 or source.opacity_texture is not None:
+            left_out.append("opacity of glass")
         if not is_closed():
             left_out.append("the refraction of glass that is not closed")
             ior = THIN_IOR
@@ -77,6 +83,12 @@ def import_material(
         if strength == 0.0:
             fields["emission_texture"] = None
         images = {name: image for name, image in fields.items() if image is not None}
+        names = {name: name for name in images}
+        opacity_texture = None
+        if source.opacity_texture is not None:
+            is_own = source.opacity_texture == source.texture
+            opacity_texture = "texture" if is_own else "opacity_texture"
+            images[opacity_texture] = source.opacity_texture
         # split into a strength and a color whose largest channel is 1
         red, green, blue = (value / strength if strength else 1.0 for value in source.emission_linear)
         material = MetallicRoughness(
@@ -87,7 +99,10 @@ def import_material(
             normal_scale=abs(source.normal_scale),
             emission=strength,
             emission_srgb=_to_srgb((red, green, blue)),
-            **{name: name for name in images},
+            opacity=_clamp_unit(source.opacity),
+            opacity_texture=opacity_texture,
+            opacity_cutoff=cutoff,
+            **names,
         )
     if left_out:
         warn(f"of the material {source.name or 'without a name'} is not used: {', '.join(left_out)}.")

@@ -33,6 +33,23 @@ from octasplat.engine.pathtracing.stage.model import (
 )
 
 
+class Opacity(NamedTuple):
+    """What is there of a surface.
+
+    Attributes:
+        factor: share of it, times that of the texture.
+        texture: number of a texture, -1 for none.
+        cutoff: the surface is there where the opacity reaches this; -1 for none.
+    """
+
+    factor: float = 1.0
+    texture: int = -1
+    cutoff: float = -1.0
+
+
+WHOLE = Opacity()
+
+
 @dataclass(frozen=True)
 class EmissiveMesh:
     """Triangles of equal emission.
@@ -42,12 +59,14 @@ class EmissiveMesh:
         corner_uv: texture coordinates.
         rgb_linear: radiance.
         texture: number of a texture that is multiplied by it, -1 for none.
+        opacity: of the surface; what is not there does not shine.
     """
 
     corners_world: Float32[np.ndarray, "f 3 3"]
     corner_uv: Float32[np.ndarray, "f 3 2"]
     rgb_linear: Float64[np.ndarray, "3"]
     texture: int = -1
+    opacity: Opacity = WHOLE
 
 
 class _MeshTables(NamedTuple):
@@ -101,6 +120,7 @@ def build_light_arrays(
     positions, axes, rgb, sides_u, sides_v = np.zeros((5, count, 3))
     areas, cosines = np.zeros(count), np.tile([0.0, 1.0], (count, 1))
     textures, rows = np.full(count, -1, np.int32), np.zeros((count, 3), np.int64)
+    opacities, opacity_cutoffs, opacity_textures = np.ones(count), np.full(count, -1.0), textures.copy()
     for l, light in enumerate(lights):
         color = srgb_to_linear(np.array(light.color_srgb))
         adds[l] = light.adds_light
@@ -129,6 +149,7 @@ def build_light_arrays(
         # mean of the surface, for estimates of its distance
         positions[l] = own @ mesh.corners_world.mean(axis=1, dtype=np.float64) / own.sum()
         textures[l], rows[l] = mesh.texture, tables.rows[l - len(lights)]
+        opacities[l], opacity_textures[l], opacity_cutoffs[l] = mesh.opacity
     radiance, frame = np.zeros((1, 1, 3), np.float32), np.eye(3)  # the kernels need a map: one black pixel
     if environment is not None:
         radiance, frame = environment.radiance_linear, environment.frame
@@ -147,6 +168,9 @@ def build_light_arrays(
         adds_light=adds,
         any_adds_light=bool(adds.any()),
         textures=textures,
+        opacities=opacities,
+        opacity_textures=opacity_textures,
+        opacity_cutoffs=opacity_cutoffs,
         mesh_rows=rows,
         mesh_cdf=tables.cdf,
         mesh_corners_world=tables.corners_world,

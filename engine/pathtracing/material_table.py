@@ -1,7 +1,7 @@
 """All materials of a stage as table rows, with albedo tables and textures."""
 
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -15,6 +15,7 @@ from octasplat.engine.pathtracing.bsdf_tables import albedo_table, rough_dielect
 from octasplat.engine.pathtracing.kernels.kernel_args import MaterialArrays
 from octasplat.engine.pathtracing.kernels.principled_bsdf import BURLEY, COUPLED
 from octasplat.engine.pathtracing.kernels.surface import DIFFUSE, EMITTER, GLASS, MIRROR, PRINCIPLED
+from octasplat.engine.pathtracing.lights import Opacity
 from octasplat.engine.pathtracing.stage.materials import (
     Dielectric,
     Diffuse,
@@ -29,8 +30,9 @@ from octasplat.engine.pathtracing.stage.materials import (
 from octasplat.engine.render.image_files import read_image
 
 MAX_TEXELS = 1 << 27
-TextureUse = Literal["color", "light", "data"]
-"""What an image holds: display colors, display colors of light, or numbers that are taken as they are."""
+TextureUse = Literal["color", "light", "data", "alpha", "alpha or grey"]
+"""What an image holds: display colors, display colors of light, or numbers that are taken as they are; or its
+alpha is meant, of an image without one 1 everywhere or its first channel."""
 
 _DEFAULTS: dict[str, np.ndarray] = {
     "kinds": np.array(DIFFUSE, np.int32),
@@ -42,6 +44,9 @@ _DEFAULTS: dict[str, np.ndarray] = {
     "substrates": np.array(COUPLED, np.int32),
     "energy_compensation": np.array(1, np.int32),
     "coat_tables": np.array(0, np.int32),
+    "opacities": np.array(1.0),
+    "opacity_textures": np.array(-1, np.int32),
+    "opacity_cutoffs": np.array(-1.0),
     "color_textures": np.array(-1, np.int32),
     "metallic_roughness_textures": np.array(-1, np.int32),
     "normal_textures": np.array(-1, np.int32),
@@ -50,6 +55,8 @@ _DEFAULTS: dict[str, np.ndarray] = {
     "light_ids": np.array(-1, np.int32),
 }
 """What a material is where it says nothing else."""
+
+OPACITY_COLUMNS = ("opacities", "opacity_textures", "opacity_cutoffs")
 
 
 class MaterialTable:
@@ -122,6 +129,7 @@ class MaterialTable:
             row |= {"iors": material.ior, "coat_tables": self._albedo_table_id("coat", material.ior)}
         if isinstance(material, Diffuse | Dielectric | MetallicRoughness):
             row["color_textures"] = texture(material.texture, "color")
+            row |= _opacity_columns(material, texture)
         if isinstance(material, NormalMapped):
             row["normal_textures"] = texture(material.normal_texture, "data")
             row["normal_scales"] = material.normal_scale
@@ -135,12 +143,13 @@ class MaterialTable:
         self._rows.append({"kinds": EMITTER, "light_ids": light_id})
         return len(self._rows) - 1
 
-    def set_emissive(self, row: int, light_id: int) -> int:
-        """Make a row emissive as well; return the texture of its emission, -1 for none."""
+    def set_emissive(self, row: int, light_id: int) -> tuple[int, Opacity]:
+        """Make a row emissive as well; return the texture of its emission, -1 for none, and its opacity."""
         self._rows[row]["light_ids"] = light_id
-        texture = self._rows[row]["emission"]
+        values = self._rows[row]
+        texture = values["emission"]
         assert isinstance(texture, int)
-        return texture
+        return texture, Opacity(*(values[name] for name in OPACITY_COLUMNS))  # type: ignore[arg-type]
 
     def arrays(self) -> MaterialArrays:
         """Return all rows as arrays."""
@@ -186,8 +195,8 @@ class MaterialTable:
                 values = _read_pixels(image)
             except DatasetError as error:
                 raise ConfigError(f"{label}: {error}") from None
-            rgb = values[..., :3] if values.shape[2] >= 3 else np.repeat(values[..., :1], 3, axis=2)
-            if use != "data" and image.suffix.lower() not in (".exr", ".hdr"):
+            rgb = _channels_of_use(values, use)
+            if use in ("color", "light") and image.suffix.lower() not in (".exr", ".hdr"):
                 rgb = srgb_to_linear(rgb)
             if not np.isfinite(rgb).all():
                 raise ConfigError(f"{label}: {image.name} holds values that are not finite; mend the image.")
@@ -199,6 +208,33 @@ class MaterialTable:
                     f"{image.name}: the textures have more than {MAX_TEXELS >> 20} million pixels together."
                 )
         return self._textures[image, use]
+
+
+def _opacity_columns(
+    material: Diffuse | Dielectric | MetallicRoughness, texture: Callable[[str | None, TextureUse], int]
+) -> dict[str, object]:
+    """Return the columns of what is there of a surface; ``texture`` gives the number of an image."""
+    is_own = material.opacity_texture == material.texture
+    image = texture(material.opacity_texture, "alpha" if is_own else "alpha or grey")
+    opacity, cutoff = material.opacity, material.opacity_cutoff
+    # one number and a cutoff: all of it or nothing
+    if image < 0 and cutoff is not None:
+        opacity, cutoff = float(opacity >= cutoff), None
+    return dict(zip(OPACITY_COLUMNS, (opacity, image, -1.0 if cutoff is None else cutoff), strict=True))
+
+
+def _channels_of_use(values: Float32[np.ndarray, "h w c"], use: TextureUse) -> Float32[np.ndarray, "h w 3"]:
+    """Return the three channels of an image that are meant; a single one thrice."""
+    count = values.shape[2]
+    if use in ("alpha", "alpha or grey"):
+        if count in (2, 4):
+            return np.repeat(values[..., -1:], 3, axis=2)
+        return np.ones((*values.shape[:2], 3), np.float32) if use == "alpha" else _repeated_grey(values)
+    return values[..., :3] if count >= 3 else _repeated_grey(values)
+
+
+def _repeated_grey(values: Float32[np.ndarray, "h w c"]) -> Float32[np.ndarray, "h w 3"]:
+    return np.repeat(values[..., :1], 3, axis=2)
 
 
 def _read_pixels(image: FileImage) -> Float32[np.ndarray, "h w c"]:

@@ -17,6 +17,7 @@ from octasplat.engine.pathtracing.denoising import load_denoiser
 from octasplat.engine.pathtracing.film import Film
 from octasplat.engine.pathtracing.gaussian_layers import GaussianLayers
 from octasplat.engine.pathtracing.kernels.camera_paths import start_paths
+from octasplat.engine.pathtracing.kernels.cutouts import pass_holes
 from octasplat.engine.pathtracing.kernels.gaussian_layer import (
     LayerLight,
     add_layer_light,
@@ -284,16 +285,17 @@ class PathTracer:
             )
             hits = meshes.triangles.closest(rays)
             shadows = allocate_shadow_rays(len(active))
-            met = MeshHits(hits.distances, hits.faces, hits.barycentrics)
             bounce = Bounce(
                 paths=paths,
                 active=active,
                 depth=depth,
-                hits=met,
+                hits=MeshHits(hits.distances, hits.faces, hits.barycentrics),
                 scene=scene,
                 integrator=self._integrator,
                 shadows=shadows,
             )
+            if meshes.queries.any_cutout:
+                self._run_kernel(pass_holes, len(active), meshes.queries, bounce)
             if layers is not None:
                 traced = layers.trace(rays, hits.distances)
                 layer = LayerArrays(

@@ -214,6 +214,25 @@ def test_textured_dielectric_matches_mitsuba(tmp_path: Path) -> None:
     print("textured", same(stage_of(FLOOR, box), tmp_path, [GROUND, plain, lamp()], {}))  # noqa: T201
 
 
+def test_opacity_texture_matches_mitsuba(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    values = np.kron(rng.random((4, 4)), np.ones((32, 32)))
+    write_png(tmp_path / "holes.png", np.repeat(values[..., None], 3, axis=2).astype(np.float32))
+    texture = {"type": "bitmap", "filename": str(tmp_path / "holes.png"), "raw": True}
+    red = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": linear(0.8, 0.2, 0.2)}}
+    for cutoff in (None, 0.5):
+        material = Diffuse(color_srgb=(0.8, 0.2, 0.2), opacity_texture="holes.png", opacity_cutoff=cutoff)
+        box = StageMesh(
+            shape="cube", scale=0.7, position=(0, -0.7, 0), rotation_degrees=(0, 35, 0), material=material
+        )
+        if cutoff is not None:
+            # theirs has no cutoff: the image is cut before, and looked up without blending
+            write_png(tmp_path / "holes.png", np.repeat((values >= 0.5)[..., None], 3, 2).astype(np.float32))
+            texture["filter_type"] = "nearest"
+        bsdf = {"type": "mask", "opacity": texture, "bsdf": red}
+        print("holes", cutoff, same(stage_of(FLOOR, box), tmp_path, [GROUND, bsdf, lamp()], {}))  # noqa: T201
+
+
 def test_point_and_directional_lights(tmp_path: Path) -> None:
     lights = (
         PointLight(position=(1, -3, -2), intensity=6),

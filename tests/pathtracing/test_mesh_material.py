@@ -251,10 +251,10 @@ def test_missing_textures_are_named(tmp_path: Path) -> None:
 
 def test_unsupported_material_feature_warns(tmp_path: Path) -> None:
     material = {
-        "name": "cloth", "alphaMode": "BLEND",
+        "name": "cloth", "alphaMode": "DITHER",
         "extensions": {"KHR_materials_sheen": {}, "KHR_materials_unlit": {}},
     }  # fmt: skip
     write_glb(tmp_path / "a.glb", primitive_shape("plane"), [material])
     said: list[str] = []
     compile_meshes(Stage(meshes=(StageMesh(file="a.glb"),)), tmp_path, warn=said.append)
-    assert said == ["a.glb: of the material cloth is not used: KHR_materials_sheen, alphaMode BLEND."]
+    assert said == ["a.glb: of the material cloth is not used: KHR_materials_sheen, alphaMode DITHER."]

@@ -46,6 +46,9 @@ class MaterialArrays(NamedTuple):
         substrates: how the ground shares light with the coat.
         energy_compensation: whether light that facets throw at each other is kept.
         coat_tables: which of the tables the coat has; of rough glass that of entering, leaving has the next.
+        opacities: share of the surface that is there, times that of the texture.
+        opacity_textures: number of a texture, -1 for none.
+        opacity_cutoffs: the surface is there where the opacity reaches this, else not; -1 for none.
         color_textures: number of a texture, -1 for none.
         metallic_roughness_textures: likewise.
         normal_textures: likewise.
@@ -68,6 +71,9 @@ class MaterialArrays(NamedTuple):
     substrates: Int32[np.ndarray, " m"]
     energy_compensation: Int32[np.ndarray, " m"]
     coat_tables: Int32[np.ndarray, " m"]
+    opacities: Float64[np.ndarray, " m"]
+    opacity_textures: Int32[np.ndarray, " m"]
+    opacity_cutoffs: Float64[np.ndarray, " m"]
     color_textures: Int32[np.ndarray, " m"]
     metallic_roughness_textures: Int32[np.ndarray, " m"]
     normal_textures: Int32[np.ndarray, " m"]
@@ -97,6 +103,9 @@ class LightArrays(NamedTuple):
         adds_light: whether the light is added to shadowed Gaussians.
         any_adds_light: whether any is.
         textures: of meshes, -1 for none.
+        opacities: of meshes, see :class:`MaterialArrays`, as the next two.
+        opacity_textures: number of a texture, -1 for none.
+        opacity_cutoffs: -1 for none.
         mesh_rows: of meshes: first and last row of their sums, and first triangle.
         mesh_cdf: cumulative shares of the triangles' areas, from 0 to 1 for each mesh.
         mesh_corners_world: of the triangles of all meshes.
@@ -123,6 +132,9 @@ class LightArrays(NamedTuple):
     adds_light: Int32[np.ndarray, " l"]
     any_adds_light: bool
     textures: Int32[np.ndarray, " l"]
+    opacities: Float64[np.ndarray, " l"]
+    opacity_textures: Int32[np.ndarray, " l"]
+    opacity_cutoffs: Float64[np.ndarray, " l"]
     mesh_rows: Int64[np.ndarray, "l 3"]
     mesh_cdf: Float64[np.ndarray, " s"]
     mesh_corners_world: Float32[np.ndarray, "f 3 3"]
@@ -220,17 +232,19 @@ class MeshQueries(NamedTuple):
 
     Attributes:
         closest_hit: the nearest of all triangles.
-        any_hit: whether there is any triangle.
-        any_hit_opaque: whether there is any that is not glass.
-        closest_hit_glass: the nearest of glass; its scene is 0 where there is no glass.
-        glass_faces: rows in the surfaces of the faces of glass.
+        any_hit: whether there is any triangle that has no holes, see :mod:`.cutouts`.
+        any_hit_opaque: whether there is any that has no holes and is not of glass.
+        closest_hit_filter: the nearest of those that let light pass; its scene is 0 where there are none.
+        filter_faces: rows in the surfaces of the faces that let light pass.
+        any_cutout: whether some have holes.
     """
 
     closest_hit: EmbreeQuery
     any_hit: EmbreeQuery
     any_hit_opaque: EmbreeQuery
-    closest_hit_glass: EmbreeQuery
-    glass_faces: Int64[np.ndarray, " g"]
+    closest_hit_filter: EmbreeQuery
+    filter_faces: Int64[np.ndarray, " g"]
+    any_cutout: bool
 
 
 class IntegratorParameters(NamedTuple):

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from octasplat.engine.core.compilation import kernel
+from octasplat.engine.pathtracing.kernels.cutouts import eval_opacity, has_holes
 from octasplat.engine.pathtracing.kernels.environment_light import (
     eval_environment,
     sample_cdf,
@@ -25,6 +26,7 @@ from octasplat.engine.pathtracing.kernels.kernel_args import (
     LightArrays,
 )
 from octasplat.engine.pathtracing.kernels.principled_bsdf import orthonormal_basis
+from octasplat.engine.pathtracing.kernels.surface import interpolate_uv
 from octasplat.engine.pathtracing.kernels.texture import eval_texture
 from octasplat.engine.trace.kernels.native import njit_no_refcount
 
@@ -230,12 +232,11 @@ def _sample_mesh(
     cosine = abs(n_x * way_x + n_y * way_y + n_z * way_z) / length
     if cosine <= 1e-9:  # seen edge on it sends nothing, and its density would be infinite
         return way_x, way_y, way_z, distance, 0.0, 0.0, 0.0, 1.0
-    red, green, blue = eval_emission(
-        lights,
-        l,
-        a * uv[0, 0] + b * uv[1, 0] + c * uv[2, 0],
-        a * uv[0, 1] + b * uv[1, 1] + c * uv[2, 1],
-    )
+    t_u, t_v = interpolate_uv(uv, a, b, c)
+    red, green, blue = eval_emission(lights, l, t_u, t_v)
+    if has_holes(lights, l):
+        share = eval_opacity(lights, l, t_u, t_v)
+        red, green, blue = share * red, share * green, share * blue
     return way_x, way_y, way_z, distance, red, green, blue, squared / (cosine * lights.areas[l])
 
 

@@ -164,7 +164,10 @@ class PathScratch(NamedTuple):
         samples: of paths.
         random_numbers: pairs of uniform numbers.
         rows: those of a block that something is done for.
-        t_starts: where their rays begin.
+        origins: of their rays.
+        directions: likewise.
+        t_starts: where they begin on their rays.
+        t_ends: where they end.
         is_occluded: whether something is in their way.
         distances: of what they met.
         faces: likewise.
@@ -176,7 +179,10 @@ class PathScratch(NamedTuple):
     samples: Int32[np.ndarray, " b"]
     random_numbers: Float64[np.ndarray, "d 2 b"]
     rows: Int32[np.ndarray, " b"]
+    origins: Float32[np.ndarray, "b 3"]
+    directions: Float32[np.ndarray, "b 3"]
     t_starts: Float32[np.ndarray, " b"]
+    t_ends: Float32[np.ndarray, " b"]
     is_occluded: Bool[np.ndarray, " b"]
     distances: Float32[np.ndarray, " b"]
     faces: Int32[np.ndarray, " b"]
@@ -261,7 +267,9 @@ def allocate_path_scratch(threads: int) -> list[PathScratch]:
         PathScratch(
             allocate_embree_scratch(1)[0], np.empty(BLOCK_SIZE, np.uint32), np.empty(BLOCK_SIZE, np.int32),
             np.empty((SAMPLE_PAIRS_PER_BOUNCE - 1, 2, BLOCK_SIZE)), np.empty(BLOCK_SIZE, np.int32),
-            np.empty(BLOCK_SIZE, np.float32), np.empty(BLOCK_SIZE, np.bool_),
+            np.empty((BLOCK_SIZE, 3), np.float32), np.empty((BLOCK_SIZE, 3), np.float32),
+            np.empty(BLOCK_SIZE, np.float32), np.empty(BLOCK_SIZE, np.float32),
+            np.empty(BLOCK_SIZE, np.bool_),
             np.empty(BLOCK_SIZE, np.float32), np.empty(BLOCK_SIZE, np.int32),
             np.empty((BLOCK_SIZE, 2), np.float32),
         )

@@ -6,11 +6,12 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from octasplat.engine.core.compilation import kernel
+from octasplat.engine.pathtracing.kernels.cutouts import MAX_CUTOUTS, eval_opacity, restart_distance
 from octasplat.engine.pathtracing.kernels.kernel_args import MaterialArrays, MeshQueries, SurfaceArrays
 from octasplat.engine.pathtracing.kernels.path_args import BLOCK_SIZE, PathScratch, ShadowRayArrays
 from octasplat.engine.pathtracing.kernels.principled_bsdf import fresnel_dielectric
 from octasplat.engine.pathtracing.kernels.rough_dielectric import MIN_GLASS_ROUGHNESS
-from octasplat.engine.pathtracing.kernels.surface import face_normal
+from octasplat.engine.pathtracing.kernels.surface import GLASS, face_normal, interpolate_uv
 from octasplat.engine.trace.kernels.native import njit_no_refcount
 from octasplat.engine.trace.kernels.triangles import (
     EmbreeQuery,
@@ -21,8 +22,6 @@ from octasplat.engine.trace.kernels.triangles import (
 )
 
 MAX_GLASS_SURFACES = 16
-RESTART_SCALE = np.float32(1 + 1e-6)
-RESTART_OFFSET = np.float32(1e-7)
 
 
 @njit_no_refcount(forceinline=True)
@@ -74,7 +73,17 @@ def _trace_occlusion(
 
 
 @njit_no_refcount(forceinline=True)
-def _trace_glass(
+def _glass_share(materials: MaterialArrays, m: int, cosine: float, passes_rough_glass: bool) -> float:
+    """Return the share of light that a surface of glass lets straight through."""
+    # rough glass passes light on by paths from its own surface
+    if not passes_rough_glass and materials.roughness[m] >= MIN_GLASS_ROUGHNESS and materials.iors[m] != 1.0:
+        return 0.0
+    reflectance, _ = fresnel_dielectric(min(abs(cosine), 1.0), materials.iors[m])
+    return 1.0 - reflectance
+
+
+@njit_no_refcount(forceinline=True)
+def _trace_filters(
     queries: MeshQueries,
     surfaces: SurfaceArrays,
     materials: MaterialArrays,
@@ -85,45 +94,51 @@ def _trace_glass(
     passes_rough_glass: bool,
     transmittance: Float32[np.ndarray, "n 3"],
 ) -> None:
-    """Attenuate ``count`` rows on their way straight through glass, by Fresnel, tint and Beer's law."""
+    """Attenuate ``count`` rows on their way straight through what lets light pass.
+
+    That is glass, by Fresnel, tint and Beer's law, and what has holes, by its opacity.
+    """
     for k in range(BLOCK_SIZE):
         scratch.t_starts[k] = 0.0
+    for i in range(count):
+        scratch.rows[i] -= first
     # Starts are kept by the row's place in the block.
     rays = TriangleRays(
         shadows.origins_world[first:], shadows.directions_world[first:], scratch.t_starts,
         shadows.t_max[first:], scratch.rows,
     )  # fmt: skip
     met = TriangleHitArrays(scratch.distances, scratch.faces, scratch.barycentrics)
-    for _ in range(MAX_GLASS_SURFACES):
-        closest_hits(queries.closest_hit_glass, rays, 0, count, False, scratch.embree, met)
+    for _ in range(MAX_CUTOUTS if queries.any_cutout else MAX_GLASS_SURFACES):
+        closest_hits(queries.closest_hit_filter, rays, 0, count, False, scratch.embree, met)
         left = 0
         for i in range(count):
-            # rays that meet no more glass leave the list with what they have
+            # rays that meet no more of it leave the list with what they have
             if scratch.faces[i] < 0:
                 continue
             place = scratch.rows[i]
             k = first + place
-            face = queries.glass_faces[scratch.faces[i]]
+            face = queries.filter_faces[scratch.faces[i]]
             m = surfaces.material_ids[face]
-            n_x, n_y, n_z = face_normal(surfaces.corners_world[face])
-            d = shadows.directions_world[k]
-            cosine = n_x * d[0] + n_y * d[1] + n_z * d[2]
-            reflectance, _ = fresnel_dielectric(min(abs(cosine), 1.0), materials.iors[m])
-            reflectance = 1.0 - reflectance
-            if (
-                not passes_rough_glass
-                and materials.roughness[m] >= MIN_GLASS_ROUGHNESS
-                and materials.iors[m] != 1.0
-            ):
-                reflectance = 0.0  # rough glass passes light on by paths from its own surface
             t = scratch.distances[i]
-            # Out of the glass: what it absorbed on the way.
-            length = float(t - scratch.t_starts[place]) if cosine > 0.0 else 0.0
-            for channel in range(3):
-                passed = math.exp(-materials.absorption[m, channel] * length)
-                transmittance[k, channel] *= reflectance * materials.colors_linear[m, channel] * passed
-            # behind the surface, by more than the rounding of t
-            scratch.t_starts[place] = t * RESTART_SCALE + RESTART_OFFSET
+            if materials.kinds[m] == GLASS:
+                n_x, n_y, n_z = face_normal(surfaces.corners_world[face])
+                d = shadows.directions_world[k]
+                cosine = n_x * d[0] + n_y * d[1] + n_z * d[2]
+                share = _glass_share(materials, m, cosine, passes_rough_glass)
+                # Out of the glass: what it absorbed on the way.
+                length = float(t - scratch.t_starts[place]) if cosine > 0.0 else 0.0
+                for channel in range(3):
+                    passed = math.exp(-materials.absorption[m, channel] * length)
+                    transmittance[k, channel] *= share * materials.colors_linear[m, channel] * passed
+            else:
+                b, c = float(scratch.barycentrics[i, 0]), float(scratch.barycentrics[i, 1])
+                u, v = interpolate_uv(surfaces.corner_uv[face], 1.0 - b - c, b, c)
+                share = 1.0 - eval_opacity(materials, m, u, v)
+                for channel in range(3):
+                    transmittance[k, channel] *= share
+                if share <= 0.0:
+                    continue
+            scratch.t_starts[place] = restart_distance(t)
             scratch.rows[left] = place
             left += 1
         count = left
@@ -143,33 +158,28 @@ def shadow_transmittance(
     passes_rough_glass: bool,
     transmittance: Float32[np.ndarray, "n 3"],
 ) -> None:
-    """Write the share of light that meshes let through on each ray, in each channel: 0 or 1, but for glass.
+    """Write the share of light that meshes let through on each ray, in each channel.
 
-    It is 0, too, for rays that bring nothing. Where a ray is marked so, light goes straight through glass,
-    less what Fresnel, tint and Beer take. Paths find light that glass bends only where a lamp has an extent
-    and the lit point sends paths on; everywhere else glass would cast the shadow of a stone. Rough glass
-    sends paths on from its own surface, which find such light; only where none are sent
-    (``passes_rough_glass``) does it let light through as if it were smooth.
+    It is 0 or 1, but for glass and what has holes, and 0, too, for rays that bring nothing. Where a ray is
+    marked so, light goes straight through glass, less what Fresnel, tint and Beer take. Paths find light that
+    glass bends only where a lamp has an extent and the lit point sends paths on; everywhere else glass would
+    cast the shadow of a stone. Rough glass sends paths on from its own surface, which find such light; only
+    where none are sent (``passes_rough_glass``) does it let light through as if it were smooth.
     """
     for start in range(first, last, BLOCK_SIZE):
         end = min(start + BLOCK_SIZE, last)
         for k in range(start, end):
             transmittance[k, 0] = transmittance[k, 1] = transmittance[k, 2] = 0.0
         count = _select_shadow_rays(shadows, start, end, False, scratch.rows)
-        _trace_occlusion(queries.any_hit, shadows, scratch, count, transmittance)
+        count = _trace_occlusion(queries.any_hit, shadows, scratch, count, transmittance)
+        if queries.any_cutout:
+            _trace_filters(
+                queries, surfaces, materials, shadows, start, scratch, count, False, transmittance
+            )  # fmt: skip
         count = _select_shadow_rays(shadows, start, end, True, scratch.rows)
         count = _trace_occlusion(queries.any_hit_opaque, shadows, scratch, count, transmittance)
-        if queries.closest_hit_glass.scene != 0:
-            for i in range(count):
-                scratch.rows[i] -= start  # places in the block, by which the starts are kept
-            _trace_glass(
-                queries,
-                surfaces,
-                materials,
-                shadows,
-                start,
-                scratch,
-                count,
-                passes_rough_glass,
+        if queries.closest_hit_filter.scene != 0:
+            _trace_filters(
+                queries, surfaces, materials, shadows, start, scratch, count, passes_rough_glass,
                 transmittance,
-            )
+            )  # fmt: skip

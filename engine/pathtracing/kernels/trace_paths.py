@@ -5,6 +5,7 @@ from jaxtyping import Float32
 
 from octasplat.engine.core.compilation import kernel
 from octasplat.engine.pathtracing.kernels.camera_paths import start_paths
+from octasplat.engine.pathtracing.kernels.cutouts import pass_holes
 from octasplat.engine.pathtracing.kernels.kernel_args import IntegratorParameters, MeshQueries, MeshScene
 from octasplat.engine.pathtracing.kernels.path_args import (
     BLOCK_SIZE,
@@ -51,8 +52,11 @@ def trace_paths(
             met = TriangleHitArrays(hits.distances, hits.faces, hits.barycentrics)
             # neighbors have about one direction at the camera only
             closest_hits(queries.closest_hit, rays, 0, left, depth == 0, scratch.embree, met)
+            bounce = Bounce(paths, active, depth, hits, scene, integrator, shadows)
+            if queries.any_cutout:
+                pass_holes(0, left, scratch, queries, bounce)
             # --- surfaces, and light that reaches them ---
-            shade_surfaces(0, left, scratch, Bounce(paths, active, depth, hits, scene, integrator, shadows))
+            shade_surfaces(0, left, scratch, bounce)
             shadow_transmittance(
                 0, left, scratch, queries, scene.surfaces, scene.materials, shadows, False, transmittance
             )

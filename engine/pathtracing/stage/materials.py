@@ -34,7 +34,21 @@ class Emissive(StageModel):
     emission_texture: str | None = None
 
 
-class Diffuse(NormalMapped, Emissive):
+class Cutout(StageModel):
+    """A surface that may have holes, or cover what is behind it in part.
+
+    Attributes:
+        opacity: share of the surface that is there.
+        opacity_texture: image file whose alpha is multiplied by it, or whose grey where it has no alpha.
+        opacity_cutoff: the surface is there where its opacity reaches this, and else not.
+    """
+
+    opacity: UnitInterval = 1.0
+    opacity_texture: str | None = None
+    opacity_cutoff: NonNegative | None = None
+
+
+class Diffuse(NormalMapped, Emissive, Cutout):
     """A diffuse (Lambertian) surface.
 
     Attributes:
@@ -88,7 +102,7 @@ class Metal(NormalMapped):
     multiple_scattering: bool = True
 
 
-class Dielectric(NormalMapped, Emissive):
+class Dielectric(NormalMapped, Emissive, Cutout):
     """A colored substrate under a clear coat with a microfacet surface, such as plastic or glaze.
 
     Attributes:
@@ -105,7 +119,7 @@ class Dielectric(NormalMapped, Emissive):
     ior: Annotated[float, Field(gt=1, le=4)] = 1.5
 
 
-class MetallicRoughness(NormalMapped, Emissive):
+class MetallicRoughness(NormalMapped, Emissive, Cutout):
     """glTF's material: a mixture of a dielectric and a metal.
 
     Attributes:

@@ -16,7 +16,9 @@ from octasplat.engine.pathtracing.stage.sidecar_files import sidecar_files
 from octasplat.engine.pathtracing.stage.stage_errors import stage_error
 
 MAX_STAGE_BYTES = 16 << 20
-TEXTURE_KEYS = ("texture", "metallic_roughness_texture", "normal_texture", "emission_texture")
+TEXTURE_KEYS = (
+    "texture", "metallic_roughness_texture", "normal_texture", "emission_texture", "opacity_texture",
+)  # fmt: skip
 """Keys of materials that name images."""
 
 
