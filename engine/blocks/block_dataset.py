@@ -27,6 +27,7 @@ class BlockDataset:
         self.test_indices: Int64[np.ndarray, " h"] = np.zeros(0, np.int64)
         self.has_alpha: bool = dataset.has_alpha
         self.extent: float = dataset.extent
+        self.has_known_distances: bool = dataset.has_known_distances
 
     def rays(
         self, view: Int64[np.ndarray, " r"], y: Int64[np.ndarray, " r"], x: Int64[np.ndarray, " r"]
@@ -39,3 +40,9 @@ class BlockDataset:
     ) -> tuple[Float32[np.ndarray, "r 3"], Float32[np.ndarray, " r"], Float32[np.ndarray, " r"]]:
         """Return straight display color, alpha and weight of pixels."""
         return self._dataset.pixels(view, y, x)
+
+    def known_distances(
+        self, view: Int64[np.ndarray, " r"], y: Int64[np.ndarray, " r"], x: Int64[np.ndarray, " r"]
+    ) -> Float32[np.ndarray, " r"]:
+        """Return distances of the surface along the rays of pixels, world units; 0 where unknown."""
+        return self._dataset.known_distances(view, y, x)

@@ -2,6 +2,8 @@
 
 images/<name>, or input/<name>      photographs; without these folders all photographs that there are
 masks/<name>.png                    masks, where there are any
+depths/<name>.png, or depth/        depth maps, where there are any, see
+                                    :mod:`octasplat.engine.dataset.depth_maps`
 sparse, colmap/sparse, distorted/sparse, each also with a number below it: cameras, images, points3D, rigs
                                     and frames (.bin or .txt); the same beside the photographs, if all are
                                     there, as Metashape and RealityScan export them
@@ -30,7 +32,9 @@ IMAGES = "images/"
 """What the names of a scene's photographs begin with."""
 MIN_PHOTOGRAPHS = 3
 """Fewer photographs than this do not make a scene."""
-SCENE_FOLDERS = ("images", "masks", "sparse", "colmap", "distorted")
+DEPTH_FOLDERS = ("depths", "depth")
+"""Folders of depth maps, in the order in which they are looked for."""
+SCENE_FOLDERS = ("images", "masks", *DEPTH_FOLDERS, "sparse", "colmap", "distorted")
 """Folders whose names say what is in them."""
 
 MASK_ENDING = "_mask"
@@ -59,9 +63,20 @@ class FileRole(Enum):
 
     IMAGE = "image"
     MASK = "mask"
+    DEPTH = "depth"
     MODEL = "model"
     CONTROL = "control"
     OTHER = "other"
+
+
+_DEPTHS = tuple((folder,) for folder in DEPTH_FOLDERS)
+_KEPT_ROLES = (FileRole.MODEL, FileRole.MASK, FileRole.DEPTH, FileRole.CONTROL)
+"""Roles of files that keep their names; photographs are moved to ``images/``."""
+_ROLES_BY_FOLDER = {
+    "images": FileRole.IMAGE,
+    "masks": FileRole.MASK,
+    **dict.fromkeys(DEPTH_FOLDERS, FileRole.DEPTH),
+}
 
 
 @dataclass(frozen=True)
@@ -104,7 +119,7 @@ def lay_out_scene(paths: Sequence[str]) -> SceneLayout:
     unused = _unused_model_files(names.values())
     files: dict[str, str] = {}
     for path, name in names.items():
-        if name not in unused and file_role(name) in (FileRole.MODEL, FileRole.MASK, FileRole.CONTROL):
+        if name not in unused and file_role(name) in _KEPT_ROLES:
             files[name] = path
         elif name.startswith(top) and is_photograph(name, results):
             files[f"images/{name.removeprefix(top)}"] = path
@@ -123,14 +138,15 @@ def _unused_model_files(names: Iterable[str]) -> set[str]:
 
 
 def is_photograph(name: str, results: Iterable[str] = ()) -> bool:
-    """Return whether a file is a photograph by its path: no mask in a folder of them, and no result of a run.
+    """Return whether a file is a photograph by its path: no mask, no depth map, and no result of a run.
 
     Args:
         name: path below the folder of the scene.
         results: folders of runs, with their slashes.
     """
-    in_masks = "masks" in PurePosixPath(name).parts[:-1]
-    return _is_picture(name) and not in_masks and not any(name.startswith(folder) for folder in results)
+    folders = PurePosixPath(name).parts[:-1]
+    is_map = "masks" in folders or folders[:1] in _DEPTHS
+    return _is_picture(name) and not is_map and not any(name.startswith(folder) for folder in results)
 
 
 def results_folders(names: Iterable[str]) -> tuple[str, ...]:
@@ -150,7 +166,7 @@ def file_role(name: str) -> FileRole:
         return FileRole.CONTROL
     top, slash, rest = name.partition("/")
     if slash and rest and _is_picture(rest):
-        return {"images": FileRole.IMAGE, "masks": FileRole.MASK}.get(top, FileRole.OTHER)
+        return _ROLES_BY_FOLDER.get(top, FileRole.OTHER)
     return FileRole.OTHER
 
 

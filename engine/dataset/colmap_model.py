@@ -69,6 +69,7 @@ class ColmapModel:
             :mod:`octasplat.engine.core.local_origin`.
         held_out: names of the images that the model's files hold out; None where they do not say.
         masks: paths of masks that the files name, by the names of their images.
+        depths: paths of depth maps, likewise.
     """
 
     folder: Path
@@ -79,6 +80,7 @@ class ColmapModel:
     origin_world: Origin = NO_ORIGIN
     held_out: tuple[str, ...] | None = None
     masks: Mapping[str, str] = field(default_factory=dict)
+    depths: Mapping[str, str] = field(default_factory=dict)
 
 
 def read_colmap_model(
@@ -130,6 +132,7 @@ def colmap_model_of(loaded: LoadedModel, folder: Path, *, origin_world: Origin |
         origin_world=origin,
         held_out=loaded.held_out,
         masks=loaded.masks,
+        depths=loaded.depths,
     )
 
 

@@ -27,12 +27,14 @@ class LoadedModel:
         notes: sentences on what was read otherwise than it stands there, or not at all.
         held_out: names of the images that the files hold out; None where they do not say.
         masks: paths of masks, by the names of their images.
+        depths: paths of depth maps, likewise.
     """
 
     reconstruction: Any
     notes: tuple[str, ...] = ()
     held_out: tuple[str, ...] | None = None
     masks: Mapping[str, str] = field(default_factory=dict)
+    depths: Mapping[str, str] = field(default_factory=dict)
 
 
 def load_model(path: Path, sizes_px: Mapping[str, tuple[int, int]] | None = None) -> LoadedModel:
@@ -52,7 +54,7 @@ def load_model(path: Path, sizes_px: Mapping[str, tuple[int, int]] | None = None
     if path.is_file():
         found = read_transforms(path, lambda names: _photograph_sizes(names, path.parent, sizes_px))
         reconstruction, _ = _build(path, found.records)
-        return LoadedModel(reconstruction, found.records.repairs, found.held_out, found.masks)
+        return LoadedModel(reconstruction, found.records.repairs, found.held_out, found.masks, found.depths)
     check_binary_colmap_model(path)
     is_binary = all((path / f"{part}.bin").is_file() for part in MODEL_FILES)
     if is_binary or is_plain_text_model(path):

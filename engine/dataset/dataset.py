@@ -1,6 +1,7 @@
 """Datasets with their pixels: rays and colors of any pixels of any views."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -12,6 +13,7 @@ from octasplat.engine.core.local_origin import NO_ORIGIN, Origin
 from octasplat.engine.core.rays import ImageRays, RayBatch
 from octasplat.engine.dataset.camera import Camera
 from octasplat.engine.dataset.camera_clearance import camera_clearances
+from octasplat.engine.dataset.depth_maps import DepthMaps, depth_maps_digest, fit_unit, open_depth_maps
 from octasplat.engine.dataset.kernels import gather
 from octasplat.engine.dataset.load import load_dataset_model
 from octasplat.engine.dataset.model import DatasetModel, DatasetView, Observations, SparsePoints, Viewpoints
@@ -32,6 +34,8 @@ from octasplat.engine.dataset.views_file import ViewsRecord, views_record
 
 MaskUse = Literal["ignore", "alpha"]
 
+MIN_AXIS_COSINE = 0.05
+"""Depths along the axis tell nothing of rays farther from it than this cosine."""
 NEAR_FROM_POINTS = 0.25
 """Most that the near distance may be of the distance at which things begin.
 
@@ -62,6 +66,7 @@ class Dataset:
         trained_pixels: how often each pixel is drawn where there is a region; None stands for evenly.
         has_alpha: whether any pixel can have an alpha below 1.
         has_masks: whether any view has a mask.
+        has_known_distances: whether any view has a depth map.
         extent: radius of the training cameras, see :func:`octasplat.engine.dataset.model.scene_extent`.
         near_world: distance from the cameras at which anything is seen: ``near`` of the extent, but at most
             :data:`NEAR_FROM_POINTS` of the least distance at which the sparse points around a training camera
@@ -79,6 +84,8 @@ class Dataset:
         near: float = 0.0,
         near_world: float | None = None,
         region: Region | None = None,
+        depth_maps: DepthMaps | None = None,
+        depths_sha256: str | None = None,
     ) -> None:
         self.root: Path = model.root
         self.views: tuple[DatasetView, ...] = model.views
@@ -97,7 +104,9 @@ class Dataset:
             else model.points
         )
         self.observations: Observations = model.observations
-        self.views_record: ViewsRecord = views_record(model, cache.digests, self.test_indices)
+        self.views_record: ViewsRecord = views_record(model, cache.digests, self.test_indices, depths_sha256)
+        self._depth_maps = depth_maps
+        self.has_known_distances: bool = depth_maps is not None
         self.has_masks: bool = len(cache.mask.values) > 0
         self._mask_is_alpha = masks == "alpha"
         self.has_alpha: bool = len(cache.alpha.values) > 0 or (self._mask_is_alpha and self.has_masks)
@@ -138,6 +147,7 @@ class Dataset:
         stored_split: Mapping[str, bool] | None = None,
         model: str | None = None,
         region: Region | None = None,
+        depth_unit: float | None = None,
     ) -> "Dataset":
         """Load a scene and decode its photographs into ``cache_dir``, or reuse those already cached there.
 
@@ -163,6 +173,8 @@ class Dataset:
             stored_split: whether each view is held out by the run that goes on, see :class:`SplitRule`.
             model: which of several models of the scene to take, by its path below it or its number.
             region: the box to train in detail; None trains all of the scene alike.
+            depth_unit: world units for one unit of the depth maps' values, see
+                :mod:`octasplat.engine.dataset.depth_maps`; None finds it by the sparse points.
 
         Raises:
             DatasetError: something is missing, damaged or inconsistent.
@@ -176,13 +188,23 @@ class Dataset:
         # Fail before the expensive decoding.
         rule = SplitRule(test_every, held_out, burst_length, split, stored_split)
         parts = split_scene(scene, rule)
-        digests = None
+        digests, depths_sha256, depth_maps = None, depth_maps_digest(scene), None
         if check_views is not None:
             digests = file_digests(scene, cache_dir, threads=threads)
-            check_views(views_record(scene, digests, parts.test_indices))
+            check_views(views_record(scene, digests, parts.test_indices, depths_sha256))
+        if depths_sha256 is not None:
+            depth_maps = open_depth_maps(
+                scene, cache_dir, depths_sha256, unit_world=depth_unit, threads=threads
+            )
+            if depth_unit is None:
+                depth_maps, note = fit_unit(depth_maps, scene, parts.train_indices)
+                scene = replace(scene, warnings=(*scene.warnings, note))
         cache = open_pixel_cache(scene, cache_dir, digests, threads=threads, progress=progress)
         tables = open_ray_tables(scene.cameras, cache_dir, max_table_bytes)
-        return cls(scene, cache, tables, split=parts, masks=masks, near=near, region=region)
+        return cls(
+            scene, cache, tables, split=parts, masks=masks, near=near, region=region,
+            depth_maps=depth_maps, depths_sha256=depths_sha256,
+        )  # fmt: skip
 
     @classmethod
     def open_for_evaluation(
@@ -280,6 +302,25 @@ class Dataset:
         raise_for_pixels(bad, view, y, x)
         weight[self._view_rays.invalid_rays(view, y, x)] = 0.0
         return rgb, alpha, weight
+
+    def known_distances(
+        self, view: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"], x: Int[np.ndarray, " n"]
+    ) -> Float32[np.ndarray, " n"]:
+        """Return distances of the surface along the rays of pixels by depth maps, world units; 0 if unknown.
+
+        Raises:
+            IndexError: a pixel does not exist.
+        """
+        if self._depth_maps is None:
+            return np.zeros(len(view), np.float32)
+        view, y, x = as_int64(view), as_int64(y), as_int64(x)
+        depth = self._depth_maps.z_world(view, y, x, self._view_rays.sizes)
+        _, directions = self._view_rays.trace(view, y, x)
+        axes = np.stack([each.rotation_cam_from_world[2] for each in self.views])
+        along = np.einsum("nk,nk->n", directions, axes[view])
+        # pixels of weight 0 and rays beside or behind the plane of the camera know nothing
+        known = (depth > 0) & (along > MIN_AXIS_COSINE) & ~self._view_rays.invalid_rays(view, y, x)
+        return np.divide(depth, along, out=np.zeros(len(view)), where=known).astype(np.float32)
 
     def view_rays(self, view_index: int) -> ImageRays:
         """Return all rays of one view."""

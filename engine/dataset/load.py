@@ -11,6 +11,7 @@ from octasplat.engine.core.errors import ConfigError, DatasetError
 from octasplat.engine.core.local_origin import Origin, describe_origin, is_set
 from octasplat.engine.core.relative_paths import normalize_name
 from octasplat.engine.core.scene_layout import (
+    DEPTH_FOLDERS,
     MIN_PHOTOGRAPHS,
     is_photograph,
     left_out_sentences,
@@ -18,6 +19,7 @@ from octasplat.engine.core.scene_layout import (
 )
 from octasplat.engine.dataset.camera import Camera
 from octasplat.engine.dataset.colmap_model import ColmapModel, PosedImage, read_colmap_model
+from octasplat.engine.dataset.depth_maps import find_depth_maps
 from octasplat.engine.dataset.image_info import ImageInfo
 from octasplat.engine.dataset.image_names import match_image_names
 from octasplat.engine.dataset.images import read_image_info
@@ -76,10 +78,11 @@ def load_dataset_model(
         warnings.append(f"The model in {found.folder} has no 3D points; the start will be random.")
     located = _find_images(image_folder(root), found, warnings, warn_unposed=model_folder is None)
     masks = _mask_paths(root, located, warnings)
+    depths = _depth_paths(root, located, found.depths, warnings)
     if model_folder is None:
         _warn_of_other_models(root, found.folder, warnings)
 
-    return _model_of_views(root, found, located, masks, max_side, warnings)
+    return _model_of_views(root, found, located, masks, depths, max_side, warnings)
 
 
 def _check_root(root: Path, *, has_found_model: bool) -> None:
@@ -201,6 +204,31 @@ def _mask_paths(root: Path, located: _LocatedImages, warnings: list[str]) -> lis
     return masks
 
 
+def _depth_paths(
+    root: Path, located: _LocatedImages, named: Mapping[str, str], warnings: list[str]
+) -> Sequence[Path | None]:
+    names = [image.name for image in located.images]
+    folder = next((root / each for each in DEPTH_FOLDERS if (root / each).is_dir()), None)
+    if folder is None:
+        if named:
+            warnings.append(
+                f"{len(named)} depth maps that the transforms file names are not used; put them into "
+                f"{root / DEPTH_FOLDERS[0]}."
+            )
+        return [None] * len(names)
+    by_file = {located.file_name(name): path for name, path in named.items()}
+    found = find_depth_maps(names, files_below(folder), by_file)
+    without = [name for name, path in zip(names, found, strict=True) if path is None]
+    if len(without) == len(names):
+        warnings.append(
+            f"No depth map in {folder} belongs to a photograph; one is named like its photograph "
+            f"({PurePosixPath(names[0]).stem}.png)."
+        )
+    elif without:
+        warnings.append(f"{len(without)} photographs have no depth map ({_name_list(without)}).")
+    return found
+
+
 def _check_size(camera: Camera, info: ImageInfo, image: PosedImage, path: Path) -> None:
     # Photographs may be resized: their ratio of sides must be the camera's, up to the rounding of one side.
     expected_height = camera.height_px * info.width_px / camera.width_px
@@ -237,6 +265,7 @@ def _model_of_views(
     found: ColmapModel,
     located: _LocatedImages,
     masks: Sequence[Path | None],
+    depths: Sequence[Path | None],
     max_side: int | None,
     warnings: list[str],
 ) -> DatasetModel:
@@ -246,7 +275,7 @@ def _model_of_views(
     infos: list[ImageInfo] = []
     observed_px: list[Float64[np.ndarray, "k 2"]] = []
     camera_indices: dict[Camera, int] = {}
-    for image, path, mask in zip(images, located.paths, masks, strict=True):
+    for image, path, mask, depth in zip(images, located.paths, masks, depths, strict=True):
         info = read_image_info(path)
         original = found.cameras[image.camera_id]
         _check_size(original, info, image, path)
@@ -258,6 +287,7 @@ def _model_of_views(
                 name=image.name,
                 image_path=path,
                 mask_path=mask,
+                depth_path=depth,
                 camera_index=camera_indices.setdefault(camera, len(camera_indices)),
                 rotation_cam_from_world=image.rotation_cam_from_world,
                 translation_cam_from_world=image.translation_cam_from_world,

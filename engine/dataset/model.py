@@ -44,10 +44,12 @@ class DatasetView(PosedView):
     Attributes:
         image_path: the photograph on disk.
         mask_path: ``masks/<name>.png`` where there is one.
+        depth_path: its depth map where there is one, see :mod:`octasplat.engine.dataset.depth_maps`.
     """
 
     image_path: Path
     mask_path: Path | None
+    depth_path: Path | None = None
 
 
 @dataclass(frozen=True, eq=False)

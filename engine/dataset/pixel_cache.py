@@ -157,11 +157,16 @@ def _cache_key(model: DatasetModel) -> str:
 
 
 def _file_digests(view: DatasetView) -> FileDigests:
-    photograph = _sha256(view.image_path)
-    return FileDigests(photograph, None if view.mask_path is None else _sha256(view.mask_path))
+    photograph = file_sha256(view.image_path)
+    return FileDigests(photograph, None if view.mask_path is None else file_sha256(view.mask_path))
 
 
-def _sha256(path: Path) -> str:
+def file_sha256(path: Path) -> str:
+    """Return the SHA-256 of a file of the scene, hexadecimal.
+
+    Raises:
+        DatasetError: it cannot be read.
+    """
     try:
         with path.open("rb") as handle:
             return hashlib.file_digest(handle, "sha256").hexdigest()

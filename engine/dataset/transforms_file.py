@@ -69,6 +69,7 @@ class _Frame(_Lens):
         list[Annotated[list[_Number], Field(min_length=4, max_length=4)]], Field(min_length=3, max_length=4)
     ]
     mask_path: str | None = None
+    depth_file_path: str | None = None
 
 
 class _File(_Lens):
@@ -91,11 +92,13 @@ class TransformsModel:
         records: cameras, photographs, and points if a file names some.
         held_out: names of the photographs to hold out; None where the files do not say.
         masks: paths of masks as the files have them, by the names of their photographs.
+        depths: those of depth maps, likewise.
     """
 
     records: ModelRecords
     held_out: tuple[str, ...] | None
     masks: Mapping[str, str]
+    depths: Mapping[str, str]
 
 
 def transforms_file(root: Path) -> Path | None:
@@ -133,6 +136,7 @@ def read_transforms(path: Path, sizes_of: SizesOf) -> TransformsModel:
     cameras: dict[tuple[object, ...], CameraRecord] = {}
     images: dict[int, ImageRecord] = {}
     masks: dict[str, str] = {}
+    depths: dict[str, str] = {}
     sizes_px = sizes_of(_unsized_photographs(files))
     for part, file in zip(parts, files, strict=True):
         for frame in file.frames:
@@ -144,11 +148,13 @@ def read_transforms(path: Path, sizes_of: SizesOf) -> TransformsModel:
             images[number] = _posed_image(part, frame, number, name, camera.camera_id)
             if frame.mask_path is not None:
                 masks[name] = frame.mask_path
+            if frame.depth_file_path is not None:
+                depths[name] = frame.depth_file_path
     notes += _unread_keys(parts, files)
     points = _read_points(path, files[0].ply_file_path, notes)
     by_id = {camera.camera_id: camera for camera in cameras.values()}
     records = ModelRecords(by_id, images, points, tuple(notes))
-    return TransformsModel(records, None if held_out is None else tuple(held_out), masks)
+    return TransformsModel(records, None if held_out is None else tuple(held_out), masks, depths)
 
 
 def photograph_name(file_path: str) -> str:

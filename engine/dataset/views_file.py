@@ -100,13 +100,16 @@ class ViewsRecord(_FrozenModel):
     cameras: tuple[_CameraEntry, ...]
     views: Annotated[tuple[_ViewEntry, ...], Field(min_length=1)]
     origin_world: _Row = NO_ORIGIN
+    depths_sha256: str | None = None
 
     @model_serializer(mode="wrap")
-    def _without_zero_origin(self, write: Callable[["ViewsRecord"], dict[str, object]]) -> dict[str, object]:
+    def _without_defaults(self, write: Callable[["ViewsRecord"], dict[str, object]]) -> dict[str, object]:
         content = write(self)
-        # Left out where it is zero, so that fingerprints are those of records that know no origin
+        # Left out where there is none, so that fingerprints are those of records that do not know of it
         if not is_set(self.origin_world):
             del content["origin_world"]
+        if self.depths_sha256 is None:
+            del content["depths_sha256"]
         return content
 
     @model_validator(mode="after")
@@ -190,6 +193,8 @@ class ViewsRecord(_FrozenModel):
                 return f"{_name_list(names)} with another {what}"
         if self.points_sha256 != other.points_sha256:
             return "other sparse points"
+        if self.depths_sha256 != other.depths_sha256:
+            return "other depth maps"
         return None if self == other else "another split"
 
     def is_of_same_world(self, other: "ViewsRecord") -> bool:
@@ -236,7 +241,10 @@ class ViewsRecord(_FrozenModel):
 
 
 def views_record(
-    model: DatasetModel, digests: Sequence[FileDigests], test_indices: Int64[np.ndarray, " test"]
+    model: DatasetModel,
+    digests: Sequence[FileDigests],
+    test_indices: Int64[np.ndarray, " test"],
+    depths_sha256: str | None = None,
 ) -> ViewsRecord:
     """Return the record of a dataset and its split.
 
@@ -244,6 +252,7 @@ def views_record(
         model: the scene.
         digests: of the files of its views, in their order.
         test_indices: views that are held out; where all are, they give the extent.
+        depths_sha256: digest of the depth maps, where there are any.
     """
     held_out = set(test_indices.tolist())
     train = [index for index in range(len(model.views)) if index not in held_out] or sorted(held_out)
@@ -251,6 +260,7 @@ def views_record(
         origin_world=model.origin_world,
         extent_world=_training_extent(model, np.array(train)),
         points_sha256=_points_digest(model.points),
+        depths_sha256=depths_sha256,
         cameras=tuple(
             _CameraEntry(model=c.model, params=c.params, width_px=c.width_px, height_px=c.height_px)
             for c in model.cameras

@@ -258,6 +258,7 @@ def open_run_dataset(
         near=config.train.near,
         origin_world=run_origin(output),
         region=_region(config),
+        depth_unit=config.depth_unit,
         threads=threads,
         progress=lambda done, total: progress(PhaseProgress("load", done, total)),
     )

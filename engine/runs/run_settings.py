@@ -69,6 +69,12 @@ class RunSettings(BaseModel):
         description="What masks mean: ignore leaves masked pixels out of the loss, alpha takes the mask as "
         "the alpha, for objects that are cut out.",
     )
+    depth_unit: Annotated[float | None, Unit("world"), ADVANCED] = Field(
+        None,
+        gt=0,
+        description="World units for one unit of the values of depth maps (depths/); by default the sparse "
+        "points decide, or metres where there are too few (0.001 for integers).",
+    )
     evaluation_background: Annotated[Literal["black", "white"] | None, ADVANCED] = Field(
         None,
         description="What lies behind renders and photographs with alpha when they are compared; by default "

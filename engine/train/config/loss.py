@@ -58,6 +58,13 @@ class LossWeights(Settings):
         description="Weight of what hides the sparse points from views that show them: free space along "
         "their lines of sight. Raise it where something floats before the cameras; materials use 0.05.",
     )
+    depth: Annotated[float, Unit("weight"), ADVANCED] = Field(
+        0.1,
+        ge=0,
+        description="Weight of the mean difference between rendered depths and depth maps, as a share of "
+        "the depth; of use where the scene has depths/. Raise it where surfaces waver, lower it where depth "
+        "maps are rough.",
+    )
     depth_normal: Annotated[float, Unit("weight"), ADVANCED] = Field(
         0.0,
         ge=0,

@@ -21,6 +21,7 @@ from octasplat.engine.shading.recipes import material_shading
 from octasplat.engine.train.config import TrainConfig, max_gaussian_count
 from octasplat.engine.train.initialization.initial_background import InitialBackground, estimate_background
 from octasplat.engine.train.initialization.plane_sweep import plane_sweep_points
+from octasplat.engine.train.initialization.plane_sweep_points import PlaneSweepPoints
 from octasplat.engine.train.loop.state import TrainState, initial_state
 from octasplat.engine.train.sampling.pixel_sampler import valid_pixel_fraction
 from octasplat.engine.train.shading_factory import ShadingOptions, find_background, make_shading
@@ -94,12 +95,15 @@ def initial_gaussians(
     """
     # a stream of its own: 0 is the training's, 1 the probe's
     rng = np.random.Generator(np.random.PCG64([options.seed, 2]))
-    points, limit = dataset.points, options.max_count
-    if len(points.xyz_world) >= MIN_POINTS:
+    limit, has_depths = options.max_count, dataset.has_known_distances
+    xyz, rgb = dataset.points.xyz_world, dataset.points.rgb_srgb
+    if has_depths and len(xyz) < limit:
+        lifted = lift_known_pixels(dataset, limit - len(xyz), rng)
+        xyz, rgb = np.concatenate([xyz, lifted.xyz_world]), np.concatenate([rgb, lifted.rgb_srgb])
+    if len(xyz) >= MIN_POINTS:
         centres = np.stack([dataset.views[i].origin_world for i in dataset.train_indices])
-        xyz, rgb = points.xyz_world, points.rgb_srgb
         max_angles = np.full(len(xyz), MAX_ANGULAR_SIZE)
-        if options.plane_sweep and len(xyz) < limit:
+        if options.plane_sweep and not has_depths and len(xyz) < limit:
             gains = equalizing_gains(dataset) if options.equalizes_exposure else None
             more = plane_sweep_points(
                 dataset, limit - len(xyz), rng,
@@ -134,6 +138,21 @@ def initial_gaussians(
         opacity=options.opacity,
         rng=rng,
     )
+
+
+def lift_known_pixels(dataset: Dataset, count: int, rng: np.random.Generator) -> PlaneSweepPoints:
+    """Return points of pixels of the training views whose distance depth maps tell, at most ``count``.
+
+    Pixels are drawn at random, all of them as likely; those of unknown distance are left out, so that what
+    few of them show gets no more points than its share.
+    """
+    view, y, x = dataset.sample_pixels(rng, count)
+    distance = dataset.known_distances(view, y, x)
+    rgb, alpha, weight = dataset.pixels(view, y, x)
+    known = (distance > 0) & (weight > 0) & (alpha > 0)
+    rays = dataset.rays(view[known], y[known], x[known])
+    xyz = rays.origins_world + distance[known, None] * rays.directions_world
+    return PlaneSweepPoints(xyz.astype(np.float32), rgb[known], np.zeros(len(xyz), np.bool_))
 
 
 def add_initial_materials(gaussians: FlatGaussians, settings: MaterialSettings) -> FlatGaussians:

@@ -20,6 +20,7 @@ from octasplat.engine.trace.protocol import GaussianGradients, Tracer
 from octasplat.engine.train.config import LearningRates, LossWeights
 from octasplat.engine.train.densify import Densifier
 from octasplat.engine.train.loop.state import TrainState
+from octasplat.engine.train.optimization.depth_loss import add_depth_gradient
 from octasplat.engine.train.optimization.losses import BatchLoss, batch_loss, ray_errors
 from octasplat.engine.train.sampling.batches import Batch
 from octasplat.engine.train.sampling.visibility_rays import free_space_gradient
@@ -87,6 +88,9 @@ def loss_and_gradients(
     grad = ShadedRayGradients(loss.gradient, loss.gradient @ batch.background_srgb)
     grad_shading = shading.backward(traced, shaded, grad)
     grad_trace = grad_shading.trace
+    # while rays share one order, depths have no gradients
+    if batch.known_distances is not None and tracer.settings.sort == "ray":
+        grad_trace = add_depth_gradient(grad_trace, result, batch.known_distances, weights.depth)
     if with_errors:
         grad_trace = replace(grad_trace, ray_errors=ray_errors(render, batch.target_srgb, batch.weight))
     recorded = [(result.recording, grad_trace), *grad_shading.recorded_traces]

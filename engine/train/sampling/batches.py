@@ -21,6 +21,8 @@ from octasplat.engine.train.config import (
 )
 from octasplat.engine.train.sampling.pixel_sampler import (
     TrainingData,
+    has_known_distances,
+    known_distances,
     pixel_sampler,
     valid_pixel_fraction,
 )
@@ -36,7 +38,8 @@ class Batch:
     The last ``ssim_patch_count * side * side`` rays are patches, row-major one after another.
     ``ray_patches`` says which of the others form patches. ``background_srgb`` lies
     behind both the Gaussians and photographs with alpha. ``visibility_rays`` end before points that views
-    show.
+    show. ``known_distances`` are those of the surface along the rays by depth maps, world units, 0 where
+    unknown.
     """
 
     rays: RayBatch
@@ -49,6 +52,7 @@ class Batch:
     background_srgb: Float32[np.ndarray, "3"]
     visibility_rays: RayBatch | None = None
     ray_patches: RayPatches | None = None
+    known_distances: Float32[np.ndarray, " r"] | None = None
 
     @cached_property
     def target_srgb(self) -> Float32[np.ndarray, "r 3"]:
@@ -70,6 +74,7 @@ class BatchOptions:
         ssim_patch_side_px: side of a whole patch, in pixels.
         visibility_ray_fraction: visibility rays beside each batch, of its rays; 0 where the loss has no term
             for them.
+        reads_depths: whether the loss has a term for depth maps.
     """
 
     rays_per_batch: int
@@ -79,6 +84,7 @@ class BatchOptions:
     ssim_patch_fraction: float | None
     ssim_patch_side_px: int
     visibility_ray_fraction: float
+    reads_depths: bool = False
 
     @classmethod
     def from_config(cls, config: TrainConfig, dataset: TrainingData) -> "BatchOptions":
@@ -98,6 +104,7 @@ class BatchOptions:
             ssim_patch_fraction=config.ssim_patch_fraction if config.loss.ssim > 0 else None,
             ssim_patch_side_px=config.ssim_patch_side,
             visibility_ray_fraction=config.visibility_ray_fraction if config.loss.free_space > 0 else 0.0,
+            reads_depths=config.loss.depth > 0,
         )
 
 
@@ -124,6 +131,7 @@ class BatchSource:
         self._options = options
         self.sampler = pixel_sampler(dataset, dataset.train_indices)
         self._ssim_patches = self._patch_count()
+        self._reads_depths = options.reads_depths and has_known_distances(dataset)
         self._visibility_rays: VisibilityRays | None = None
         needs_visibility_rays = options.visibility_ray_fraction > 0
         if needs_visibility_rays and isinstance(dataset, ObservedPoints) and len(dataset.points):
@@ -155,6 +163,10 @@ class BatchSource:
         view, y, x = (np.concatenate(parts) for parts in zip(*pixels, strict=True))
         rays = self._dataset.rays(view, y, x)
         rgb, alpha, weight = self._dataset.pixels(view, y, x)
+        distances = None
+        if self._reads_depths:  # what is masked may hide the surface
+            shown = (weight > 0) & (alpha > 0)
+            distances = np.where(shown, known_distances(self._dataset, view, y, x), np.float32(0.0))
         background = self._background_colors(rng)
         visibility_rays = None
         if self._visibility_rays is not None and len(self._visibility_rays):
@@ -172,6 +184,7 @@ class BatchSource:
             background_srgb=background,
             visibility_rays=visibility_rays,
             ray_patches=ray_patches,
+            known_distances=distances,
         )
         _ = batch.target_srgb  # worked out here, as the next batch is drawn beside the iteration
         return batch

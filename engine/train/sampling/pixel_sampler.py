@@ -61,6 +61,36 @@ def trained_pixels(dataset: TrainingData) -> Rectangles | None:
     return dataset.trained_pixels if isinstance(dataset, PartialTrainingData) else None
 
 
+@runtime_checkable
+class MeasuredTrainingData(TrainingData, Protocol):
+    """Photographs of which some have depth maps."""
+
+    has_known_distances: bool
+
+    def known_distances(
+        self, view: Int64[np.ndarray, " r"], y: Int64[np.ndarray, " r"], x: Int64[np.ndarray, " r"]
+    ) -> Float32[np.ndarray, " r"]:
+        """Return distances of the surface along the rays of pixels, world units; 0 where unknown."""
+        ...
+
+
+def has_known_distances(dataset: TrainingData) -> bool:
+    """Return whether depth maps tell anything of the photographs."""
+    return isinstance(dataset, MeasuredTrainingData) and dataset.has_known_distances
+
+
+def known_distances(
+    dataset: TrainingData,
+    view: Int64[np.ndarray, " r"],
+    y: Int64[np.ndarray, " r"],
+    x: Int64[np.ndarray, " r"],
+) -> Float32[np.ndarray, " r"]:
+    """Return distances of the surface along the rays of pixels, world units; 0 where unknown."""
+    if isinstance(dataset, MeasuredTrainingData):
+        return dataset.known_distances(view, y, x)
+    return np.zeros(len(view), np.float32)
+
+
 def pixel_sampler(dataset: TrainingData, view_indices: Int64[np.ndarray, " v"]) -> "PixelSampler":
     """Return a sampler of some views: of all their pixels, or of those that are trained on."""
     trained = trained_pixels(dataset)

@@ -4,12 +4,17 @@ from dataclasses import replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 from scipy.spatial.transform import Rotation
 
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.dataset import Camera, DatasetView
-from octasplat.engine.train.sampling.pixel_sampler import TrainingData, trained_pixels
+from octasplat.engine.train.sampling.pixel_sampler import (
+    TrainingData,
+    has_known_distances,
+    known_distances,
+    trained_pixels,
+)
 from octasplat.engine.train.views.image_alignment import RigidMotion
 
 FIT_ROUNDS = 3
@@ -44,6 +49,7 @@ class CorrectedDataset:
         self.test_indices: Int64[np.ndarray, " h"] = given.test_indices
         self.has_alpha = given.has_alpha
         self.extent = given.extent
+        self.has_known_distances = has_known_distances(given)
         self.trained_pixels = trained_pixels(given)
         self.set_corrections(np.zeros((len(given.views), 6)))
 
@@ -81,6 +87,12 @@ class CorrectedDataset:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the pixels of the photographs."""
         return self.original.pixels(view, y, x)
+
+    def known_distances(
+        self, view: Int64[np.ndarray, " r"], y: Int64[np.ndarray, " r"], x: Int64[np.ndarray, " r"]
+    ) -> Float32[np.ndarray, " r"]:
+        """Return distances of the surface along the rays of pixels, world units; 0 where unknown."""
+        return known_distances(self.original, view, y, x)
 
 
 def correct_view(view: DatasetView, motion: RigidMotion) -> DatasetView:
