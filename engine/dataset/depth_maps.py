@@ -17,6 +17,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import TypedDict
 
 import numpy as np
 import OpenImageIO as oiio
@@ -230,9 +231,16 @@ def _depth_ratios(
     return in_model[known] / in_map[known]
 
 
-def _read_index(folder: Path, digest: str) -> dict[str, list[list[int]]] | None:
+class _Index(TypedDict):
+    version: int
+    digest: str
+    sizes_px: list[list[int]]
+    are_integers: list[bool]
+
+
+def _read_index(folder: Path, digest: str) -> _Index | None:
     try:
-        index = json.loads((folder / _INDEX).read_text(encoding="utf-8"))
+        index: _Index = json.loads((folder / _INDEX).read_text(encoding="utf-8"))
         count = sum(width * height for width, height in index["sizes_px"])
         is_whole = (folder / _VALUES).stat().st_size == 4 * count
     except (OSError, ValueError, KeyError, TypeError):
@@ -241,7 +249,7 @@ def _read_index(folder: Path, digest: str) -> dict[str, list[list[int]]] | None:
     return index if is_whole and is_same else None
 
 
-def _decode(model: DatasetModel, folder: Path, digest: str, threads: int) -> dict[str, list[list[int]]]:
+def _decode(model: DatasetModel, folder: Path, digest: str, threads: int) -> _Index:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / _INDEX).unlink(missing_ok=True)  # an index must never describe a file that is being written
     sizes_px: list[list[int]] = []
@@ -260,9 +268,11 @@ def _decode(model: DatasetModel, folder: Path, digest: str, threads: int) -> dic
             sizes_px.append([depth.shape[1], depth.shape[0]])
             are_integers.append(is_integer)
             file.write(depth.tobytes())
-    index = {"version": CACHE_VERSION, "digest": digest, "sizes_px": sizes_px, "are_integers": are_integers}
+    index: _Index = {
+        "version": CACHE_VERSION, "digest": digest, "sizes_px": sizes_px, "are_integers": are_integers,
+    }  # fmt: skip
     write_json(folder / _INDEX, index)
-    return index  # type: ignore[return-value]
+    return index
 
 
 def _check_sides(path: Path | None, shape: tuple[int, ...], photograph_px: tuple[int, int]) -> None:

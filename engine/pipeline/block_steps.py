@@ -130,7 +130,7 @@ def _coarse_cache(run: ReconstructionRun) -> Path:
 
 
 def _block_work(run: ReconstructionRun) -> BlockWork:
-    dataset, config = run.dataset, run.config.train
+    dataset, config = run.dataset, run.train_config
     exposure, exposure_changes = resolve_exposure(config.exposure, dataset, has_materials=False)
     if exposure_changes is not None and not has_plan(run.output / BLOCKS):  # else it was told
         run.progress(Warned(f"{exposure_changes} That is learnt; exposure=false leaves it out."))

@@ -16,6 +16,7 @@ from octasplat.engine.pipeline.block_request import BlockRequest
 from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.protocol import Tracer
+from octasplat.engine.train.config import TrainConfig, with_depth_weight
 
 OnStep = Callable[[int, Dataset, Tracer, ShadingModel, FlatGaussians], None]
 """Called between two iterations of a training: iterations done, photographs, tracer, shading, Gaussians."""
@@ -61,6 +62,11 @@ class ReconstructionRun:
     @dataset.setter
     def dataset(self, dataset: Dataset) -> None:
         self._dataset = dataset
+
+    @property
+    def train_config(self) -> TrainConfig:
+        """Return the settings of the training of these photographs."""
+        return with_depth_weight(self.config.train, has_depth_maps=self.dataset.has_known_distances)
 
 
 @runtime_checkable

@@ -68,7 +68,9 @@ class TrainStep:
         dataset, config = run.dataset, run.config
         steps = 0
         if not config.minutes:
-            steps = iteration_count(config.train, dataset.train_pixel_count, valid_pixel_fraction(dataset))
+            steps = iteration_count(
+                run.train_config, dataset.train_pixel_count, valid_pixel_fraction(dataset)
+            )
         with phase("train", run.progress, steps) as clock:
             gaussians = _train(run, clock)
             facts = SceneMetadata(
@@ -169,7 +171,7 @@ def _region_text(dataset: Dataset, trained_pixels: Rectangles) -> str:
 
 def _warn_of_useless_materials(run: ReconstructionRun) -> None:
     """Warn before a long training whose photographs plain colors explain better than materials do."""
-    config = run.config.train
+    config = run.train_config
     steps = iteration_count(config, run.dataset.train_pixel_count, valid_pixel_fraction(run.dataset))
     if (
         not config.materials.learn
@@ -265,7 +267,7 @@ def _first_state(run: ReconstructionRun, config: TrainConfig) -> TrainState:
 def _plan_settings(run: ReconstructionRun, clock: PhaseClock) -> TrainConfig:
     """Return the training's settings; those chosen by the time budget are recorded the first time."""
     settings, output = run.config, run.output
-    config = settings.train
+    config = run.train_config
     if settings.minutes is None:
         return config
     if not (output / PLAN).exists():

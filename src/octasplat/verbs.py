@@ -90,6 +90,7 @@ def reconstruct(
     poses: Literal["given", "auto", "missing"] | None = None,
     model: str | None = None,
     masks: Literal["ignore", "alpha"] | None = None,
+    depth_unit: float | None = None,
     evaluation_background: Literal["black", "white"] | None = None,
     georeference: Literal["auto", "gps", "off"] | None = None,
     control_points: str | None = None,
@@ -147,6 +148,8 @@ def reconstruct(
             sparse/1, or transforms.json; by default the COLMAP model of most photographs.
         masks: What masks mean: ignore leaves masked pixels out of the loss, alpha takes the mask as the
             alpha, for objects that are cut out. Default: ignore.
+        depth_unit: World units for one unit of the values of depth maps (depths/); by default the
+            sparse points decide, or metres where there are too few (0.001 for integers).
         evaluation_background: What lies behind renders and photographs with alpha when they are
             compared; by default that of the training: white where train.background is white, else
             black.
@@ -217,6 +220,7 @@ def reconstruct(
             "poses": poses,
             "model": model,
             "masks": masks,
+            "depth_unit": depth_unit,
             "evaluation_background": evaluation_background,
             "georeference": georeference,
             "control_points": control_points,
@@ -259,6 +263,7 @@ def estimate(
     poses: Literal["given", "auto", "missing"] | None = None,
     model: str | None = None,
     masks: Literal["ignore", "alpha"] | None = None,
+    depth_unit: float | None = None,
     evaluation_background: Literal["black", "white"] | None = None,
     georeference: Literal["auto", "gps", "off"] | None = None,
     control_points: str | None = None,
@@ -308,6 +313,8 @@ def estimate(
             sparse/1, or transforms.json; by default the COLMAP model of most photographs.
         masks: What masks mean: ignore leaves masked pixels out of the loss, alpha takes the mask as the
             alpha, for objects that are cut out. Default: ignore.
+        depth_unit: World units for one unit of the values of depth maps (depths/); by default the
+            sparse points decide, or metres where there are too few (0.001 for integers).
         evaluation_background: What lies behind renders and photographs with alpha when they are
             compared; by default that of the training: white where train.background is white, else
             black.
@@ -364,6 +371,7 @@ def estimate(
             "poses": poses,
             "model": model,
             "masks": masks,
+            "depth_unit": depth_unit,
             "evaluation_background": evaluation_background,
             "georeference": georeference,
             "control_points": control_points,
@@ -406,6 +414,7 @@ def plan(
     poses: Literal["given", "auto", "missing"] | None = None,
     model: str | None = None,
     masks: Literal["ignore", "alpha"] | None = None,
+    depth_unit: float | None = None,
     evaluation_background: Literal["black", "white"] | None = None,
     georeference: Literal["auto", "gps", "off"] | None = None,
     control_points: str | None = None,
@@ -462,6 +471,8 @@ def plan(
             sparse/1, or transforms.json; by default the COLMAP model of most photographs.
         masks: What masks mean: ignore leaves masked pixels out of the loss, alpha takes the mask as the
             alpha, for objects that are cut out. Default: ignore.
+        depth_unit: World units for one unit of the values of depth maps (depths/); by default the
+            sparse points decide, or metres where there are too few (0.001 for integers).
         evaluation_background: What lies behind renders and photographs with alpha when they are
             compared; by default that of the training: white where train.background is white, else
             black.
@@ -521,6 +532,7 @@ def plan(
             "poses": poses,
             "model": model,
             "masks": masks,
+            "depth_unit": depth_unit,
             "evaluation_background": evaluation_background,
             "georeference": georeference,
             "control_points": control_points,

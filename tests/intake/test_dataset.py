@@ -249,6 +249,7 @@ def test_dataset_inconsistent_files_are_refused(local_storage: LocalStorage) -> 
 def test_names_of_single_files() -> None:
     assert check_file_name("images/a b/ü.jpg") is FileRole.IMAGE
     assert check_file_name("masks/a.jpg.png") is FileRole.MASK
+    assert check_file_name("depths/a.exr") is FileRole.DEPTH
     assert check_file_name("sparse/0/points3D.bin") is FileRole.MODEL
     assert check_file_name("sparse/1/cameras.bin") is FileRole.MODEL
     for name, code in (

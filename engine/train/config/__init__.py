@@ -12,6 +12,7 @@ from octasplat.engine.train.config.derived import (
     ray_patch_side_px,
     rebuild_interval,
     uses_shared_sort,
+    with_depth_weight,
 )
 from octasplat.engine.train.config.learning_rates import LearningRates
 from octasplat.engine.train.config.loss import SURFACE_DEPTH_NORMAL_WEIGHT, LossWeights
@@ -45,5 +46,6 @@ __all__ = [
     "ray_patch_side_px",
     "rebuild_interval",
     "uses_shared_sort",
+    "with_depth_weight",
     "with_materials",
 ]

@@ -3,6 +3,7 @@
 import math
 
 from octasplat.engine.train.config.gaussians import GaussianSettings
+from octasplat.engine.train.config.loss import DEPTH_MAP_WEIGHT
 from octasplat.engine.train.config.train import TrainConfig
 
 MAX_PLANNED_ITERATIONS = 70_000
@@ -68,12 +69,23 @@ def max_gaussian_count(config: GaussianSettings, training_pixels: int, valid_fra
     return min(wanted, config.max_gaussians_auto)
 
 
+def with_depth_weight(config: TrainConfig, *, has_depth_maps: bool) -> TrainConfig:
+    """Return the settings for photographs with or without depth maps: the weight of these decided."""
+    if not has_depth_maps:
+        weight = None
+    elif config.loss.depth is None:
+        weight = DEPTH_MAP_WEIGHT
+    else:
+        weight = config.loss.depth
+    return config.model_copy(update={"loss": config.loss.model_copy(update={"depth": weight})})
+
+
 def uses_shared_sort(config: TrainConfig) -> bool:
     """Return whether the rays of a patch composite in one order for a part of the training.
 
     Gradients by depths and normals, and a second phase, want each ray's own.
     """
-    by_geometry = config.materials.learn or config.loss.depth_normal > 0
+    by_geometry = config.materials.learn or config.loss.depth_normal > 0 or bool(config.loss.depth)
     return config.shared_sort_until > 0 and not by_geometry and config.trace.second_phase_min is None
 
 

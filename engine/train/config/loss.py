@@ -11,6 +11,9 @@ from octasplat.engine.settings.fields import ADVANCED, EXPERIMENTAL, Unit
 SURFACE_DEPTH_NORMAL_WEIGHT = 0.05
 """Weight of ``loss.depth_normal`` for scenes of which a surface is to be made, see ``docs/surface.md``."""
 
+DEPTH_MAP_WEIGHT = 0.1
+"""Weight of ``loss.depth`` where nothing else is said, for scenes with depth maps."""
+
 
 class LossWeights(Settings):
     """Weights of the loss terms; means over the batch's valid rays and channels.
@@ -58,12 +61,12 @@ class LossWeights(Settings):
         description="Weight of what hides the sparse points from views that show them: free space along "
         "their lines of sight. Raise it where something floats before the cameras; materials use 0.05.",
     )
-    depth: Annotated[float, Unit("weight"), ADVANCED] = Field(
-        0.1,
+    depth: Annotated[float | None, Unit("weight"), ADVANCED] = Field(
+        None,
         ge=0,
-        description="Weight of the mean difference between rendered depths and depth maps, as a share of "
-        "the depth; of use where the scene has depths/. Raise it where surfaces waver, lower it where depth "
-        "maps are rough.",
+        description="Weight of the mean difference between rendered depths and depth maps, as a share of the "
+        f"depth; by default {DEPTH_MAP_WEIGHT} where the scene has depth maps. Lower it where they are "
+        "rough.",
     )
     depth_normal: Annotated[float, Unit("weight"), ADVANCED] = Field(
         0.0,

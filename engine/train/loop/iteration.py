@@ -88,8 +88,7 @@ def loss_and_gradients(
     grad = ShadedRayGradients(loss.gradient, loss.gradient @ batch.background_srgb)
     grad_shading = shading.backward(traced, shaded, grad)
     grad_trace = grad_shading.trace
-    # while rays share one order, depths have no gradients
-    if batch.known_distances is not None and tracer.settings.sort == "ray":
+    if batch.known_distances is not None and weights.depth:
         grad_trace = add_depth_gradient(grad_trace, result, batch.known_distances, weights.depth)
     if with_errors:
         grad_trace = replace(grad_trace, ray_errors=ray_errors(render, batch.target_srgb, batch.weight))

@@ -104,7 +104,7 @@ class BatchOptions:
             ssim_patch_fraction=config.ssim_patch_fraction if config.loss.ssim > 0 else None,
             ssim_patch_side_px=config.ssim_patch_side,
             visibility_ray_fraction=config.visibility_ray_fraction if config.loss.free_space > 0 else 0.0,
-            reads_depths=config.loss.depth > 0,
+            reads_depths=bool(config.loss.depth),
         )
 
 
