@@ -205,7 +205,7 @@ def test_masks_and_unused_values(scene: Path, save_image: Callable[..., None]) -
     frames = _frames(load_dataset_model(scene))
     mask = np.full((24, 32, 1), 255, np.uint8)
     for index, frame in enumerate(frames):
-        frame |= {"mask_path": f"masks/m{index}.png", "depth_file_path": f"depths/{index}.png"}
+        frame |= {"mask_path": f"masks/m{index}.png", "depth_file_path": f"depths/{index}.png", "blur": 2}
         save_image(root / "masks" / f"m{index}.png", mask)
     frames[4]["mask_path"] = "elsewhere/m4.png"
     _write(root, frames, **_PINHOLE)
@@ -219,7 +219,8 @@ def test_masks_and_unused_values(scene: Path, save_image: Callable[..., None]) -
     ]
     told = " ".join(found.warnings)
     assert "1 masks that the transforms file names are neither in masks/" in told
-    assert "values that are not used (depth_file_path)" in told
+    assert "5 depth maps that the transforms file names are not used; put them into" in told
+    assert "values that are not used (blur)" in told
 
 
 @pytest.mark.parametrize(
