@@ -1,7 +1,7 @@
 """The materials of a GLB, as far as they are understood.
 
 glTF 2.0 (https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html) and its extensions
-``KHR_materials_emissive_strength``, ``_ior``, ``_transmission``, ``_unlit``, ``_volume`` and
+``KHR_materials_clearcoat``, ``_emissive_strength``, ``_ior``, ``_transmission``, ``_unlit``, ``_volume`` and
 ``KHR_texture_transform``.
 """
 
@@ -17,10 +17,13 @@ from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.files.glb_container import GlbFile
 from octasplat.engine.geometry.mesh_material import FileImage, MeshMaterial
 
-SUPPORTED_EXTENSIONS = ("emissive_strength", "ior", "transmission", "unlit", "volume")
+SUPPORTED_EXTENSIONS = ("clearcoat", "emissive_strength", "ior", "transmission", "unlit", "volume")
 SUFFIXES = {"image/png": ".png", "image/jpeg": ".jpg", "image/webp": ".webp"}
 KINDS = {b"\x89PNG": ".png", b"\xff\xd8\xff": ".jpg", b"RIFF": ".webp"}
-PARTLY_SUPPORTED_EXTENSIONS = {"thicknessTexture", "transmissionTexture"}
+PARTLY_SUPPORTED_EXTENSIONS = {
+    "clearcoatNormalTexture", "clearcoatRoughnessTexture", "clearcoatTexture", "thicknessTexture",
+    "transmissionTexture",
+}  # fmt: skip
 
 
 def glb_materials(file: GlbFile, path: Path) -> tuple[MeshMaterial, ...]:
@@ -98,6 +101,8 @@ class _MaterialReader:
             transmission=float(extensions.get("transmission", {}).get("transmissionFactor", 0.0)),
             ior=float(extensions.get("ior", {}).get("ior", 1.5)),
             absorption=self._absorption_coefficients(),
+            clear_coat=float(extensions.get("clearcoat", {}).get("clearcoatFactor", 0.0)),
+            clear_coat_roughness=float(extensions.get("clearcoat", {}).get("clearcoatRoughnessFactor", 0.0)),
             **self._opacity(base[3], images.get("texture")),
             unsupported=self._unsupported_features(number),
             **images,  # type: ignore[arg-type]

@@ -1,7 +1,7 @@
 """The materials of an OBJ: its MTL files, as far as they are understood.
 
 The keys of http://paulbourke.net/dataformats/mtl/ with the extension for physically based rendering (``Pr``,
-``Pm``, ``norm``) that modelling programs write today. Colors are taken as linear, as Blender writes them.
+``Pm``, ``Pc``, ``norm``) that modelling programs write. Colors are taken as linear, as Blender writes them.
 """
 
 import math
@@ -13,7 +13,7 @@ from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.geometry.mesh_material import MeshMaterial, resolve_image
 
 MAX_BYTES = 64 << 20
-NUMBERS = {"Ns", "Ni", "d", "Tr", "Pr", "Pm", "illum"}
+NUMBERS = {"Ns", "Ni", "d", "Tr", "Pr", "Pm", "Pc", "Pcr", "illum"}
 COLORS = {"Kd", "Ke"}
 IMAGES = {
     "map_Kd": "texture", "map_Ke": "emission_texture", "norm": "normal_texture", "map_d": "opacity_texture",
@@ -86,6 +86,8 @@ def _parse_material(path: Path, entry: dict[str, str]) -> MeshMaterial:
         emission_linear=colors.get("Ke", (0.0, 0.0, 0.0)),
         transmission=float(clear),
         ior=numbers.get("Ni", 1.5) if numbers.get("Ni", 1.5) >= 1.0 else 1.5,
+        clear_coat=min(max(numbers.get("Pc", 0.0), 0.0), 1.0),
+        clear_coat_roughness=min(max(numbers.get("Pcr", 0.0), 0.0), 1.0),
         opacity=1.0 if clear else min(max(opacity, 0.0), 1.0),
         unsupported=tuple(passed_over),
         **found,

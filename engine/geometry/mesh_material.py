@@ -44,6 +44,8 @@ class MeshMaterial:
         opacity: share of the surface that is there.
         opacity_texture: alpha, multiplied by it; of an image other than ``texture`` that has none its grey.
         opacity_cutoff: the surface is there where the opacity reaches this; None where it covers in part.
+        clear_coat: share of the surface under a clear coat.
+        clear_coat_roughness: perceptual.
         unsupported: what else the file says of it, which is not understood, in words.
     """
 
@@ -63,6 +65,8 @@ class MeshMaterial:
     opacity: float = 1.0
     opacity_texture: FileImage | None = None
     opacity_cutoff: float | None = None
+    clear_coat: float = 0.0
+    clear_coat_roughness: float = 0.0
     unsupported: tuple[str, ...] = ()
 
 

@@ -350,6 +350,8 @@ def load_mesh_shape(
 
 def _light_triangles(light: Light, up_world: Float64[np.ndarray, "3"]) -> Float32[np.ndarray, "f 3 3"] | None:
     """Return the triangles of a visible light; None of an invisible one."""
+    if light.only_shadows:
+        return None
     if isinstance(light, PointLight) and light.radius > 0.0 and light.visible:
         ball = primitive_shape("sphere")
         corners = ball.vertices[ball.faces] * light.radius + np.array(light.position)

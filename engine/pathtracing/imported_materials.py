@@ -45,7 +45,7 @@ def import_material(
     cutoff = source.opacity_cutoff
     numbers = (
         *source.rgb_linear, *source.emission_linear, source.metallic, source.roughness, source.ior,
-        source.opacity, 0.0 if cutoff is None else cutoff,
+        source.opacity, 0.0 if cutoff is None else cutoff, source.clear_coat, source.clear_coat_roughness,
     )  # fmt: skip
     if not (np.isfinite(numbers).all() and min(numbers) >= 0.0):
         raise ConfigError(f"the material {source.name} holds a number that is negative or not finite.")
@@ -57,6 +57,8 @@ def import_material(
         left_out += [f"{key} on glass" for key, image in named.items() if image is not None]
         if source.opacity < 1.0 or source.opacity_texture is not None:
             left_out.append("opacity of glass")
+        if source.clear_coat > 0.0:
+            left_out.append("a clear coat on glass")
         if not is_closed():
             left_out.append("the refraction of glass that is not closed")
             ior = THIN_IOR
@@ -72,6 +74,8 @@ def import_material(
     else:
         if source.transmission > 0.0:
             left_out.append(f"transmission {source.transmission:g}, which is less than half")
+        if source.clear_coat > 0.0 and source.normal_texture is not None:
+            left_out.append("a clear coat that is smoother than the normal texture")
         fields = {
             "texture": source.texture,
             "metallic_roughness_texture": source.metallic_roughness_texture,
@@ -99,6 +103,8 @@ def import_material(
             normal_scale=abs(source.normal_scale),
             emission=strength,
             emission_srgb=_to_srgb((red, green, blue)),
+            clear_coat=_clamp_unit(source.clear_coat),
+            clear_coat_roughness=_clamp_unit(source.clear_coat_roughness),
             opacity=_clamp_unit(source.opacity),
             opacity_texture=opacity_texture,
             opacity_cutoff=cutoff,

@@ -117,13 +117,16 @@ def build_light_arrays(
     tables = _mesh_tables(meshes)
     count = len(lights) + len(meshes) + (environment is not None)
     kinds, visibility, adds = np.zeros((3, count), np.int32)
+    casts_shadows, lights_relit, lights_meshes = np.ones((3, count), np.int32)
     positions, axes, rgb, sides_u, sides_v = np.zeros((5, count, 3))
     areas, cosines = np.zeros(count), np.tile([0.0, 1.0], (count, 1))
     textures, rows = np.full(count, -1, np.int32), np.zeros((count, 3), np.int64)
     opacities, opacity_cutoffs, opacity_textures = np.ones(count), np.full(count, -1.0), textures.copy()
     for l, light in enumerate(lights):
         color = srgb_to_linear(np.array(light.color_srgb))
-        adds[l] = light.adds_light
+        adds[l], casts_shadows[l] = light.adds_light, light.casts_shadows
+        lights_relit[l] = not light.only_shadows
+        lights_meshes[l] = light.lights_meshes and not light.only_shadows
         if not isinstance(light, DirectionalLight):
             positions[l] = light.position
         if not isinstance(light, PointLight):
@@ -150,6 +153,9 @@ def build_light_arrays(
         positions[l] = own @ mesh.corners_world.mean(axis=1, dtype=np.float64) / own.sum()
         textures[l], rows[l] = mesh.texture, tables.rows[l - len(lights)]
         opacities[l], opacity_textures[l], opacity_cutoffs[l] = mesh.opacity
+    # light from where nothing keeps it off is not found by paths that things keep off
+    visibility *= casts_shadows
+    takes = casts_shadows * (1 - adds)
     radiance, frame = np.zeros((1, 1, 3), np.float32), np.eye(3)  # the kernels need a map: one black pixel
     if environment is not None:
         radiance, frame = environment.radiance_linear, environment.frame
@@ -166,7 +172,11 @@ def build_light_arrays(
         cosines=cosines,
         is_hittable=visibility,
         adds_light=adds,
-        any_adds_light=bool(adds.any()),
+        takes_light=takes,
+        any_takes_nothing=not takes.all(),
+        lights_relit=lights_relit,
+        lights_meshes=lights_meshes,
+        casts_shadows=casts_shadows,
         textures=textures,
         opacities=opacities,
         opacity_textures=opacity_textures,

@@ -17,6 +17,7 @@ from octasplat.engine.pathtracing.kernels.principled_bsdf import BURLEY, COUPLED
 from octasplat.engine.pathtracing.kernels.surface import DIFFUSE, EMITTER, GLASS, MIRROR, PRINCIPLED
 from octasplat.engine.pathtracing.lights import Opacity
 from octasplat.engine.pathtracing.stage.materials import (
+    ClearCoated,
     Dielectric,
     Diffuse,
     Emissive,
@@ -44,6 +45,8 @@ _DEFAULTS: dict[str, np.ndarray] = {
     "substrates": np.array(COUPLED, np.int32),
     "energy_compensation": np.array(1, np.int32),
     "coat_tables": np.array(0, np.int32),
+    "clear_coats": np.array(0.0),
+    "clear_coat_roughness": np.array(0.0),
     "opacities": np.array(1.0),
     "opacity_textures": np.array(-1, np.int32),
     "opacity_cutoffs": np.array(-1.0),
@@ -69,7 +72,7 @@ class MaterialTable:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._rows: list[dict[str, object]] = []
-        # the default, which Gaussians with materials read too
+        # the default, which Gaussians with materials and clear coats read too
         self._albedo_tables: list[tuple[str, float]] = [("coat", 1.5)]
         self._textures: dict[tuple[FileImage, TextureUse], int] = {}
         self._images: list[Float32[np.ndarray, "h w 3"]] = []
@@ -130,6 +133,8 @@ class MaterialTable:
         if isinstance(material, Diffuse | Dielectric | MetallicRoughness):
             row["color_textures"] = texture(material.texture, "color")
             row |= _opacity_columns(material, texture)
+        if isinstance(material, ClearCoated):
+            row |= {"clear_coats": material.clear_coat, "clear_coat_roughness": material.clear_coat_roughness}
         if isinstance(material, NormalMapped):
             row["normal_textures"] = texture(material.normal_texture, "data")
             row["normal_scales"] = material.normal_scale

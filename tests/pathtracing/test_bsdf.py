@@ -62,13 +62,16 @@ def test_dielectric_index_one_reflects_nothing() -> None:
 
 @pytest.mark.parametrize("metallic", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("roughness", [0.1, 0.3, 0.6, 1.0])
-def test_bsdf_white_furnace_conserves_energy(metallic: float, roughness: float) -> None:
+@pytest.mark.parametrize("coat", [{}, {"clear_coat": 0.7, "clear_coat_roughness": 0.4}])
+def test_bsdf_white_furnace_conserves_energy(
+    metallic: float, roughness: float, coat: dict[str, float]
+) -> None:
     # By the material's own samples: value over density is what each of them carries.
     n = 1 << 15
     k = np.arange(n)
     golden = np.stack([(k + 0.5) / n, (k * 0.6180339887498949) % 1, (k * 0.7548776662466927) % 1], axis=1)
     for cosine in (0.15, 0.5, 0.95):
-        white, seen = material(n, metallic=metallic, roughness=roughness), towards(cosine, n)
+        white, seen = material(n, metallic=metallic, roughness=roughness, **coat), towards(cosine, n)
         lit = white.sample(seen, golden)
         values, pdf = white.evaluate(seen, lit)
         kept = np.where(pdf > 0, values[:, 0] / np.maximum(pdf, 1e-30), 0.0).mean()
@@ -89,11 +92,12 @@ def test_bsdf_pdf_integrates_to_upper_hemisphere_share(metallic: float, roughnes
         assert abs(total - above) < 4 * np.sqrt(0.25 / n) + 1e-3
 
 
-@pytest.mark.parametrize("metallic", [0.0, 1.0])
-def test_samples_follow_their_density(metallic: float) -> None:
+@pytest.mark.parametrize(("metallic", "coat"), [(0.0, 0.0), (1.0, 0.0), (0.0, 0.8), (1.0, 1.0)])
+def test_samples_follow_their_density(metallic: float, coat: float) -> None:
     n, rows, columns, fine = 200_000, 8, 16, 12
     rng = np.random.default_rng(3)
-    some = material(n, metallic=metallic, roughness=0.6, color=0.5)
+    coated = {"clear_coat": coat, "clear_coat_roughness": 0.5}
+    some = material(n, metallic=metallic, roughness=0.6, color=0.5, **coated)
     lit = some.sample(towards(0.7, n), rng.random((n, 3)))
     lit = lit[lit[:, 2] > 0]
     angle = np.arctan2(lit[:, 1], lit[:, 0]) / (2 * np.pi) % 1
@@ -103,7 +107,7 @@ def test_samples_follow_their_density(metallic: float) -> None:
         indexing="ij",
     )  # fmt: skip
     grid = directions(cosines.ravel(), 2 * np.pi * angles.ravel())
-    pdf = material(len(grid), metallic=metallic, roughness=0.6, color=0.5).evaluate(
+    pdf = material(len(grid), metallic=metallic, roughness=0.6, color=0.5, **coated).evaluate(
         towards(0.7, len(grid)), grid
     )[1]
     patch = 2 * np.pi / len(grid)
@@ -111,6 +115,25 @@ def test_samples_follow_their_density(metallic: float) -> None:
     used = expected > 10
     statistic = ((counted - expected) ** 2 / np.maximum(expected, 1e-9))[used].sum()
     assert statistic < chi2.ppf(0.9999, used.sum())
+
+
+def test_clear_coat_sends_back_its_albedo_and_leaves_the_rest_to_what_is_below() -> None:
+    n = 1 << 15
+
+    def albedo(cosine: float, **more: float) -> float:
+        some = material(n, metallic=0.3, roughness=0.5, color=0.4, **more)
+        lit = some.sample(towards(cosine, n), golden(n))
+        values, pdf = some.evaluate(towards(cosine, n), lit)
+        return float(np.where(pdf > 0, values[:, 0] / np.maximum(pdf, 1e-30), 0.0).mean())
+
+    for cosine in (0.2, 0.6, 0.95):
+        for coat, roughness in ((1.0, 0.1), (0.5, 0.6)):
+            reflected = coat * value_of(albedo_table(1.5).directional, cosine, roughness)
+            expected = reflected + (1 - reflected) * albedo(cosine)
+            found = albedo(cosine, clear_coat=coat, clear_coat_roughness=roughness)
+            assert found == pytest.approx(expected, rel=0.01)
+    # head-on a smooth coat reflects 4 %
+    assert value_of(albedo_table(1.5).directional, 1.0, 0.0) == pytest.approx(0.04, abs=1e-3)
 
 
 def test_values_do_not_change_when_light_and_viewer_are_swapped() -> None:

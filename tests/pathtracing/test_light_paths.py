@@ -41,6 +41,7 @@ def white_sky(folder: Path, value: float = 1.0) -> Environment:
         Metal(color_srgb=WHITE, roughness=0.6),
         Metal(color_srgb=WHITE, roughness=0.15),
         Dielectric(color_srgb=WHITE, roughness=0.4),
+        Metal(color_srgb=WHITE, roughness=0.6, clear_coat=1.0, clear_coat_roughness=0.2),
     ],
     ids=lambda m: m.kind,
 )
@@ -51,6 +52,16 @@ def test_white_furnace_has_uniform_radiance(material, tmp_path: Path) -> None:  
     picture = film_of(stage, AHEAD, tmp_path).image().rgb_linear
     assert abs(picture.mean() - 1.0) < 0.01
     assert np.abs(picture.mean(axis=2) - 1).max() < 0.35
+
+
+def test_clear_coat_over_black_metal_reflects_four_percent_head_on(tmp_path: Path) -> None:
+    for share in (1.0, 0.5):
+        black = Metal(color_srgb=(0, 0, 0), clear_coat=share)
+        board = StageMesh(shape="plane", rotation_degrees=(90, 0, 0), scale=9, material=black)
+        numbers = Integrator(samples=64, max_depth=2, anti_aliasing=False)
+        stage = Stage(gaussians=(), meshes=(board,), environment=white_sky(tmp_path), integrator=numbers)
+        seen = film_of(stage, camera((0, 0, -4), (0, 0, 0), (4, 4), 0.5), tmp_path).image().rgb_linear
+        assert seen.mean() == pytest.approx(0.04 * share, abs=5e-4)
 
 
 def test_dielectric_slab_follows_beer_and_fresnel(tmp_path: Path) -> None:

@@ -127,14 +127,18 @@ def test_glb_material_and_textures_are_read(tmp_path: Path) -> None:
         "normalTexture": {"index": 2, "scale": 0.5},
         "emissiveFactor": [0.2, 0.1, 0.05],
         "emissiveTexture": {"index": 3},
-        "extensions": {"KHR_materials_emissive_strength": {"emissiveStrength": 3.0}},
+        "extensions": {
+            "KHR_materials_emissive_strength": {"emissiveStrength": 3.0},
+            "KHR_materials_clearcoat": {"clearcoatFactor": 0.8, "clearcoatRoughnessFactor": 0.3},
+        },
     }  # fmt: skip
     write_glb(tmp_path / "a.glb", cube, [material], images)
     red, green, blue = linear_to_srgb(np.array([0.8, 0.6, 0.5])).tolist()
     light = linear_to_srgb(np.array([1, 0.5, 0.25])).tolist()
     twin = MetallicRoughness(
         color_srgb=(red, green, blue), metallic=0.7, roughness=0.9, normal_scale=0.5, emission=0.6,
-        emission_srgb=(1, light[1], light[2]), **{name: f"{name}.png" for name in names},
+        emission_srgb=(1, light[1], light[2]), clear_coat=0.8, clear_coat_roughness=0.3,
+        **{name: f"{name}.png" for name in names},
     )  # fmt: skip
     found = same_as(tmp_path, "a.glb", twin)
     flat = picture(
@@ -169,11 +173,13 @@ def test_obj_materials_are_read_from_mtl(tmp_path: Path) -> None:
     checks(tmp_path / "wood bark.png", 1)
     (tmp_path / "things.mtl").write_text(
         "newmtl wood\nKd 0.5 0.5 0.5\nmap_Kd -s 1 1 1 C:\\art\\wood bark.png\nPr 0.4\nPm 0.0\n"
+        "Pc 0.5\nPcr 0.2\n"
         "newmtl lamp\nKd 0 0 0\nKe 2 2 2\n"
     )
     write_obj(tmp_path / "twin.obj", cube)
     write_obj(tmp_path / "a.obj", cube, "mtllib things.mtl\nusemtl wood")
-    same_as(tmp_path, "a.obj", MetallicRoughness(texture="wood bark.png", roughness=0.4))
+    wood = MetallicRoughness(texture="wood bark.png", roughness=0.4, clear_coat=0.5, clear_coat_roughness=0.2)
+    same_as(tmp_path, "a.obj", wood)
     text = (tmp_path / "a.obj").read_text().splitlines()
     text.insert(-6, "usemtl lamp")
     (tmp_path / "b.obj").write_text("\n".join(text) + "\n")

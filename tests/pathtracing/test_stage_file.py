@@ -77,6 +77,11 @@ def test_stage_file_with_all_keys_is_read(tmp_path: Path) -> None:
         (BALL + 'on = { view = "a.jpg" }', "either view and pixel, or origin and direction"),
         (BALL + 'material = { kind = "diffuse", emission = -1 }', r"meshes\[0\]\.material\.emission"),
         ('[[lights]]\nkind = "point"\nposition = [0, 0, 0]\nintensity = 1\nradius = -1', r"\.radius"),
+        (
+            '[[lights]]\nkind = "point"\nposition = [0, 0, 0]\nintensity = 1\n'
+            "only_shadows = true\nadds_light = true",
+            "only_shadows casts shadows and adds no light",
+        ),
         ('[[lights]]\nkind = "point"\nposition = [0, 0, 0]', r"lights\[0\].*intensity"),
         ('[[lights]]\nkind = "point"\nposition = [0, 0, 0]\nintensity = -1', r"lights\[0\]\.intensity"),
         ('[[lights]]\nkind = "directional"\ndirection = [0, 0, 0]\nirradiance = 1', "has no length"),

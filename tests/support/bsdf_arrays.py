@@ -68,6 +68,8 @@ class OpaqueMaterial:
         ior: index of refraction of the coat.
         substrate: ``coupled`` keeps all energy; ``burley`` is Disney's diffuse term.
         multiple_scattering: whether light that the metal's facets reflect to each other is kept.
+        clear_coat: share of the surface under a clear coat.
+        clear_coat_roughness: perceptual.
     """
 
     colors_linear: Float64[np.ndarray, "n 3"]
@@ -76,15 +78,16 @@ class OpaqueMaterial:
     ior: float = 1.5
     substrate: Literal["coupled", "burley"] = "coupled"
     multiple_scattering: bool = True
+    clear_coat: float = 0.0
+    clear_coat_roughness: float = 0.0
 
     def evaluate(
         self, to_viewer: Float64[np.ndarray, "n 3"], to_light: Float64[np.ndarray, "n 3"]
     ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"]]:
         """Values times the cosine to the light, and the density of :meth:`sample` over solid angle."""
         values, pdf = np.empty((len(to_viewer), 3)), np.empty(len(to_viewer))
-        coat = albedo_table(self.ior)
-        tables = AlbedoTables(albedo_table(None).directional, coat.directional, coat.mean)
-        principled_eval_array(0, len(values), to_viewer, to_light, self._arrays(), tables, values, pdf)
+        bsdf, tables = self._arrays(), self._tables()
+        principled_eval_array(0, len(values), to_viewer, to_light, bsdf, tables, values, pdf)
         return values, pdf
 
     def sample(
@@ -92,15 +95,20 @@ class OpaqueMaterial:
     ) -> Float64[np.ndarray, "n 3"]:
         """Directions to the light from three numbers in [0, 1) each; some lie below the surface."""
         to_light = np.empty((len(to_viewer), 3))
-        coat = albedo_table(self.ior).directional
-        principled_sample_array(0, len(to_light), to_viewer, self._arrays(), coat, uniform, to_light)
+        bsdf, tables = self._arrays(), self._tables()
+        principled_sample_array(0, len(to_light), to_viewer, bsdf, tables, uniform, to_light)
         return to_light
 
     def _arrays(self) -> BsdfArrays:
         substrate = BURLEY if self.substrate == "burley" else COUPLED
         return BsdfArrays(
-            self.colors_linear, self.metallic, self.roughness, self.ior, substrate, self.multiple_scattering
-        )
+            self.colors_linear, self.metallic, self.roughness, self.ior, substrate, self.multiple_scattering,
+            self.clear_coat, self.clear_coat_roughness,
+        )  # fmt: skip
+
+    def _tables(self) -> AlbedoTables:
+        coat, clear_coat = albedo_table(self.ior), albedo_table(1.5).directional
+        return AlbedoTables(albedo_table(None).directional, coat.directional, coat.mean, clear_coat)
 
 
 def fresnel(

@@ -22,7 +22,7 @@ from octasplat.engine.core.compilation import kernel
 from octasplat.engine.pathtracing.kernels.kernel_args import LayerArrays, Rgb, Vec3
 from octasplat.engine.pathtracing.kernels.lights import (
     INFINITE_DISTANCE,
-    additive_light_probability,
+    no_shadow_probability,
     sample_light,
     sample_light_index,
 )
@@ -156,22 +156,22 @@ def _query_layer_light(
     (x, y, z), (g_r, g_g, g_b) = point, weight
     # the second number: surfaces take the first
     _, pick = uniform_pair(paths.keys[p], paths.samples[p], first_pair + LIGHT_CHOICE_SAMPLE)
-    l, chance = sample_light_index(lights, x, y, z, pick)
+    l, chance = sample_light_index(lights, x, y, z, pick, False)
     if l < 0:
         return
     u, v = uniform_pair(paths.keys[p], paths.samples[p], first_pair + LAYER_LIGHT_SAMPLE)
     w_x, w_y, w_z, reach, l_r, l_g, l_b, pdf = sample_light(lights, l, x, y, z, u, v)
     n_x, n_y, n_z = normalize(normal[0], normal[1], normal[2])
     cosine = max(n_x * w_x + n_y * w_y + n_z * w_z, 0.0)
-    taking = relit + (additive if lights.adds_light[l] else 0.0)
+    taking = (relit if lights.lights_relit[l] else 0.0) + (additive if lights.adds_light[l] else 0.0)
     # a Lambertian surface with the layer's normal; a light in one direction has no density
     factor = taking * cosine / (math.pi * chance * (pdf if pdf > 0.0 else 1.0))
     shadows.radiance_linear[k, 0] = g_r * l_r * factor
     shadows.radiance_linear[k, 1] = g_g * l_g * factor
     shadows.radiance_linear[k, 2] = g_b * l_b * factor
-    if shadowed > MIN_COVERAGE and not lights.adds_light[l]:
+    if shadowed > MIN_COVERAGE and lights.takes_light[l]:
         # Only among the lights that take something is the shadow a mean.
-        losing = shadowed / max(1.0 - additive_light_probability(lights, x, y, z), 1e-6)
+        losing = shadowed / max(1.0 - no_shadow_probability(lights, x, y, z), 1e-6)
         shadows.occluded_radiance_linear[k, 0] = -g_r * losing
         shadows.occluded_radiance_linear[k, 1] = -g_g * losing
         shadows.occluded_radiance_linear[k, 2] = -g_b * losing
@@ -180,8 +180,9 @@ def _query_layer_light(
     shadows.directions_world[k, 1] = w_y
     shadows.directions_world[k, 2] = w_z
     shadows.passes_glass[k] = True
-    # short of the light's own surface
-    shadows.t_max[k] = reach * SHADOW_RAY_SCALE if reach < INFINITE_DISTANCE else math.inf
+    # short of the light's own surface; nothing is in the way of what casts no shadows
+    reach = reach * SHADOW_RAY_SCALE if reach < INFINITE_DISTANCE else math.inf
+    shadows.t_max[k] = reach if lights.casts_shadows[l] else 0.0
 
 
 @kernel(_nrt=False, error_model="numpy")

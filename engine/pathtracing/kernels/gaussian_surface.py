@@ -67,6 +67,13 @@ def _draw_samples(paths: PathArrays, p: int, pair: int, random_numbers: Float64[
         random_numbers[place, 0, 0], random_numbers[place, 1, 0] = uniform_pair(key, sample, pair + place)
 
 
+@njit_no_refcount(forceinline=True)
+def _albedo_tables(materials: MaterialArrays) -> AlbedoTables:
+    """Return the tables of these surfaces, which have the default index of refraction."""
+    coat = materials.coat_albedo[0]
+    return AlbedoTables(materials.ggx_albedo, coat, materials.coat_mean_albedo[0], coat)
+
+
 @kernel(_nrt=False, error_model="numpy")
 def intersect_gaussian_surfaces(
     first: int, last: int, scratch: PathScratch, bounce: Bounce, layer: LayerArrays
@@ -82,7 +89,7 @@ def intersect_gaussian_surfaces(
     rgb, transmittance, features = layer.rgb, layer.transmittance, layer.features
     depth_median, depth_sum, normals = layer.depth_median, layer.depth_sum, layer.normals
     samples = PathSamples(scratch.random_numbers, 0)
-    tables = AlbedoTables(materials.ggx_albedo, materials.coat_albedo[0], materials.coat_mean_albedo[0])
+    tables = _albedo_tables(materials)
     for k in range(first, last):
         p = active[k]
         shadows.radiance_linear[k, 0] = shadows.radiance_linear[k, 1] = shadows.radiance_linear[k, 2] = 0.0
@@ -138,7 +145,7 @@ def intersect_gaussian_surfaces(
             min(features[k, ALBEDO + 2] * part, 1.0),
         )
         metallic, roughness = min(features[k, METALLIC] * part, 1.0), min(features[k, ROUGHNESS] * part, 1.0)
-        bsdf = Bsdf(color, metallic, roughness, IOR, BURLEY, False)
+        bsdf = Bsdf(color, metallic, roughness, IOR, BURLEY, False, 0.0, 0.0)
         normal, query = (n_x, n_y, n_z), LightQuery(lights, integrator, shadows, k)
         scatter_path(p, samples, paths, False, SurfacePoint(point, normal, normal), bsdf, tables, query)
 
@@ -159,7 +166,7 @@ def start_paths_at_surfaces(
 ) -> None:
     """Start paths at points of surfaces, as if the camera's rays had hit them there."""
     column = PathSamples(scratch.random_numbers, 0)
-    tables = AlbedoTables(materials.ggx_albedo, materials.coat_albedo[0], materials.coat_mean_albedo[0])
+    tables = _albedo_tables(materials)
     for k in range(first, last):
         paths.keys[k], paths.samples[k] = pixel_key(integrator.seed, pixels[k]), samples[k]
         shadows.radiance_linear[k, 0] = shadows.radiance_linear[k, 1] = shadows.radiance_linear[k, 2] = 0.0
@@ -175,6 +182,6 @@ def start_paths_at_surfaces(
         material = interactions.materials[k]
         normal = float(n[0]), float(n[1]), float(n[2])
         color = float(material[0]), float(material[1]), float(material[2])
-        bsdf = Bsdf(color, float(material[3]), float(material[4]), IOR, BURLEY, False)
+        bsdf = Bsdf(color, float(material[3]), float(material[4]), IOR, BURLEY, False, 0.0, 0.0)
         query = LightQuery(lights, integrator, shadows, k)
         scatter_path(k, column, paths, False, SurfacePoint(origin, normal, normal), bsdf, tables, query)

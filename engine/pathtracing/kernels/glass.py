@@ -152,6 +152,8 @@ def scatter_rough_glass(
             factor = gain * value / (l_pdf + pdf if lights.is_hittable[l] else l_pdf)
         if value > 0.0:
             through = i_z < 0.0
+            # nothing is in the way of what casts no shadows
+            distance = distance if lights.casts_shadows[l] else 0.0
             radiance = (
                 w[0] * l_r * factor * (tint[0] if through else 1.0),
                 w[1] * l_g * factor * (tint[1] if through else 1.0),

@@ -43,6 +43,8 @@ class MaterialArrays(NamedTuple):
         roughness: perceptual.
         iors: index of refraction.
         absorption: per world unit.
+        clear_coats: share of the surface under a clear coat.
+        clear_coat_roughness: perceptual.
         substrates: how the ground shares light with the coat.
         energy_compensation: whether light that facets throw at each other is kept.
         coat_tables: which of the tables the coat has; of rough glass that of entering, leaving has the next.
@@ -68,6 +70,8 @@ class MaterialArrays(NamedTuple):
     roughness: Float64[np.ndarray, " m"]
     iors: Float64[np.ndarray, " m"]
     absorption: Float64[np.ndarray, "m 3"]
+    clear_coats: Float64[np.ndarray, " m"]
+    clear_coat_roughness: Float64[np.ndarray, " m"]
     substrates: Int32[np.ndarray, " m"]
     energy_compensation: Int32[np.ndarray, " m"]
     coat_tables: Int32[np.ndarray, " m"]
@@ -101,7 +105,11 @@ class LightArrays(NamedTuple):
         cosines: of a spot's outer and inner angle.
         is_hittable: whether rays meet the light, so that it counts for those too.
         adds_light: whether the light is added to shadowed Gaussians.
-        any_adds_light: whether any is.
+        takes_light: whether its shadows take light from them.
+        any_takes_nothing: whether some do not.
+        lights_relit: whether it lights relit Gaussians.
+        lights_meshes: whether it lights meshes, and Gaussians with materials.
+        casts_shadows: whether anything keeps it off.
         textures: of meshes, -1 for none.
         opacities: of meshes, see :class:`MaterialArrays`, as the next two.
         opacity_textures: number of a texture, -1 for none.
@@ -130,7 +138,11 @@ class LightArrays(NamedTuple):
     cosines: Float64[np.ndarray, "l 2"]
     is_hittable: Int32[np.ndarray, " l"]
     adds_light: Int32[np.ndarray, " l"]
-    any_adds_light: bool
+    takes_light: Int32[np.ndarray, " l"]
+    any_takes_nothing: bool
+    lights_relit: Int32[np.ndarray, " l"]
+    lights_meshes: Int32[np.ndarray, " l"]
+    casts_shadows: Int32[np.ndarray, " l"]
     textures: Int32[np.ndarray, " l"]
     opacities: Float64[np.ndarray, " l"]
     opacity_textures: Int32[np.ndarray, " l"]
@@ -186,7 +198,7 @@ class LayerArrays(NamedTuple):
 
 
 class Bsdf(NamedTuple):
-    """The mixture of dielectric and metal at a point.
+    """The mixture of dielectric and metal at a point, and the clear coat over it.
 
     Attributes:
         rgb: linear base color.
@@ -195,6 +207,8 @@ class Bsdf(NamedTuple):
         ior: index of refraction of the dielectric.
         substrate: how the ground shares light with the coat.
         energy_compensation: whether light that facets throw at each other is kept.
+        clear_coat: share of the surface under the clear coat.
+        clear_coat_roughness: perceptual.
     """
 
     rgb: Rgb
@@ -203,6 +217,8 @@ class Bsdf(NamedTuple):
     ior: float
     substrate: int
     energy_compensation: bool
+    clear_coat: float
+    clear_coat_roughness: float
 
 
 class SurfacePoint(NamedTuple):
@@ -220,11 +236,13 @@ class AlbedoTables(NamedTuple):
         ggx_albedo: of a colorless metal.
         coat_albedo: of the dielectric's surface.
         coat_mean_albedo: the cosine-weighted mean of ``coat_albedo`` over all directions.
+        clear_coat_albedo: of the clear coat's surface.
     """
 
     ggx_albedo: Float64[np.ndarray, "a c"]
     coat_albedo: Float64[np.ndarray, "a c"]
     coat_mean_albedo: Float64[np.ndarray, "a 2"]
+    clear_coat_albedo: Float64[np.ndarray, "a c"]
 
 
 class MeshQueries(NamedTuple):

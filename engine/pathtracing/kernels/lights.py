@@ -79,21 +79,32 @@ def light_importance(lights: LightArrays, l: int, p_x: float, p_y: float, p_z: f
 
 
 @njit_no_refcount(forceinline=True)
+def _light_weight(lights: LightArrays, l: int, p_x: float, p_y: float, p_z: float, is_mesh: bool) -> float:
+    """Return :func:`light_importance`, or 0 of a light that does not light meshes where p lies on one."""
+    if is_mesh and not lights.lights_meshes[l]:
+        return 0.0
+    return light_importance(lights, l, p_x, p_y, p_z)
+
+
+@njit_no_refcount(forceinline=True)
 def sample_light_index(
-    lights: LightArrays, p_x: float, p_y: float, p_z: float, u: float
+    lights: LightArrays, p_x: float, p_y: float, p_z: float, u: float, is_mesh: bool
 ) -> tuple[int, float]:
-    """Return a light and the probability with which it is asked at p; -1 where none shines."""
+    """Return a light and the probability with which it is asked at p; -1 where none shines.
+
+    ``is_mesh`` tells whether p lies on a mesh, or on Gaussians with materials.
+    """
     count = len(lights.kinds)
     if count == 1:
-        return (0, 1.0) if light_importance(lights, 0, p_x, p_y, p_z) > 0.0 else (-1, 0.0)
+        return (0, 1.0) if _light_weight(lights, 0, p_x, p_y, p_z, is_mesh) > 0.0 else (-1, 0.0)
     total = 0.0
     for l in range(count):
-        total += light_importance(lights, l, p_x, p_y, p_z)
+        total += _light_weight(lights, l, p_x, p_y, p_z, is_mesh)
     if not total > 0.0:
         return -1, 0.0
     left, found, share = u * total, -1, 0.0
     for l in range(count):
-        weight = light_importance(lights, l, p_x, p_y, p_z)
+        weight = _light_weight(lights, l, p_x, p_y, p_z, is_mesh)
         if weight > 0.0:
             found, share = l, weight / total  # the last one that shines, should rounding leave a rest
             left -= weight
@@ -104,10 +115,10 @@ def sample_light_index(
 
 @njit_no_refcount(forceinline=True)
 def light_probability(lights: LightArrays, light_id: int, p_x: float, p_y: float, p_z: float) -> float:
-    """Return the probability with which :func:`sample_light_index` asks the light ``light_id`` at p."""
+    """Return the probability with which :func:`sample_light_index` asks a light at p, on a mesh."""
     total, own = 0.0, 0.0
     for l in range(len(lights.kinds)):
-        weight = light_importance(lights, l, p_x, p_y, p_z)
+        weight = _light_weight(lights, l, p_x, p_y, p_z, True)
         total += weight
         if l == light_id:
             own = weight
@@ -115,17 +126,17 @@ def light_probability(lights: LightArrays, light_id: int, p_x: float, p_y: float
 
 
 @njit_no_refcount()
-def additive_light_probability(lights: LightArrays, p_x: float, p_y: float, p_z: float) -> float:
-    """Return the probability with which one of the lights that add theirs is asked at p."""
-    if not lights.any_adds_light:
+def no_shadow_probability(lights: LightArrays, p_x: float, p_y: float, p_z: float) -> float:
+    """Return the probability with which a light is asked at p whose shadows take nothing."""
+    if not lights.any_takes_nothing:
         return 0.0
-    total, adding = 0.0, 0.0
+    total, idle = 0.0, 0.0
     for l in range(len(lights.kinds)):
         weight = light_importance(lights, l, p_x, p_y, p_z)
         total += weight
-        if lights.adds_light[l]:
-            adding += weight
-    return adding / total if total > 0.0 else 0.0
+        if not lights.takes_light[l]:
+            idle += weight
+    return idle / total if total > 0.0 else 0.0
 
 
 @njit_no_refcount()
@@ -301,7 +312,7 @@ def light_samples(
     """
     for n in range(len(points)):
         p = points[n]
-        l, share = sample_light_index(lights, p[0], p[1], p[2], numbers[n, 0])
+        l, share = sample_light_index(lights, p[0], p[1], p[2], numbers[n, 0], True)
         lights_asked[n] = l
         if l < 0:
             radiance[n], density[n] = 0.0, 0.0

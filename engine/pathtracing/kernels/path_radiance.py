@@ -83,6 +83,11 @@ def shade_emitter(
     """Add the light of a shining surface; ``cosine`` is that to its front, (u, v) the place on a mesh."""
     if cosine <= 0.0:
         return
+    # of a lamp that does not light meshes, or that nothing shadows, this is no way to find light on them
+    if paths.flags[p] & FLAG_SCATTERED and not lights.lights_meshes[l]:
+        return
+    if paths.pdf[p] > 0.0 and not lights.is_hittable[l]:
+        return
     share = 1.0
     if paths.pdf[p] > 0.0:  # the camera, mirrors and glass find lights in no other way
         o = paths.origins_world[p]

@@ -143,10 +143,12 @@ def _scatter_at_material(
     bsdf = Bsdf(
         (red, green, blue), metallic, roughness,
         materials.iors[m], materials.substrates[m], materials.energy_compensation[m] != 0,
+        materials.clear_coats[m], materials.clear_coat_roughness[m],
     )  # fmt: skip
     tables = AlbedoTables(
-        materials.ggx_albedo, materials.coat_albedo[table], materials.coat_mean_albedo[table]
-    )
+        materials.ggx_albedo, materials.coat_albedo[table], materials.coat_mean_albedo[table],
+        materials.coat_albedo[0],
+    )  # fmt: skip
     off_surface = SurfacePoint(origin, point.normal, (s_x, s_y, s_z))
     scatter_path(p, samples, paths, kind == DIFFUSE, off_surface, bsdf, tables, query)
 

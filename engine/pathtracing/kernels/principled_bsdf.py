@@ -7,7 +7,8 @@ function of its arguments.
 Microfacets are those of :mod:`octasplat.engine.shading.kernels.microfacets`. Light that facets throw at each
 other: "Practical multiple scattering compensation for microfacet models" (Turquin 2019). The ground under a
 coat takes what the coat leaves, in both directions: "A Microfacet Based Coupled Specular-Matte BRDF Model"
-(Kelemen and Szirmay-Kalos 2001).
+(Kelemen and Szirmay-Kalos 2001). A clear coat lies over all of it, as in glTF's KHR_materials_clearcoat: what
+is under it keeps what the coat's directional albedo leaves, so that no light is lost or won.
 """
 
 import math
@@ -27,6 +28,7 @@ from octasplat.engine.trace.kernels.native import njit_no_refcount
 
 MIN_ALPHA = 1e-3
 COUPLED, BURLEY = 0, 1
+CLEAR_COAT_IOR = 1.5
 
 
 @njit_no_refcount(forceinline=True)
@@ -67,7 +69,7 @@ def specular_probability(o_z: float, bsdf: Bsdf, coat_albedo: Float64[np.ndarray
 
 
 @njit_no_refcount(forceinline=True)
-def principled_eval(o: Vec3, i: Vec3, bsdf: Bsdf, tables: AlbedoTables) -> tuple[float, float, float, float]:
+def _base_eval(o: Vec3, i: Vec3, bsdf: Bsdf, tables: AlbedoTables) -> tuple[float, float, float, float]:
     """Return value times cosine (three channels) and density of the mixture of dielectric and metal."""
     o_x, o_y, o_z = o
     i_x, i_y, i_z = i
@@ -118,18 +120,66 @@ def principled_eval(o: Vec3, i: Vec3, bsdf: Bsdf, tables: AlbedoTables) -> tuple
 
 
 @njit_no_refcount(forceinline=True)
-def principled_sample(
+def _base_sample(
     o: Vec3, bsdf: Bsdf, coat_albedo: Float64[np.ndarray, "a c"], choice: float, u: float, v: float
 ) -> Vec3:
-    """Draw a direction to the light, as dense as :func:`principled_eval` says; worth 0 below the surface."""
-    o_x, o_y, o_z = o
-    share = specular_probability(o_z, bsdf, coat_albedo)
+    """Draw a direction to the light, as dense as :func:`_base_eval` says; worth 0 below the surface."""
+    share = specular_probability(o[2], bsdf, coat_albedo)
     if choice >= share:
         return sample_cosine(u, v)
-    alpha = max(bsdf.roughness * bsdf.roughness, MIN_ALPHA)
+    return _sample_reflection(o, max(bsdf.roughness * bsdf.roughness, MIN_ALPHA), u, v)
+
+
+@njit_no_refcount(forceinline=True)
+def _sample_reflection(o: Vec3, alpha: float, u: float, v: float) -> Vec3:
+    """Return o reflected at a visible facet."""
+    o_x, o_y, o_z = o
     h_x, h_y, h_z = sample_visible_normal(o_x, o_y, o_z, alpha, u, v)
     twice = 2.0 * (o_x * h_x + o_y * h_y + o_z * h_z)
-    return twice * h_x - o_x, twice * h_y - o_y, twice * h_z - o_z  # o reflected at h
+    return twice * h_x - o_x, twice * h_y - o_y, twice * h_z - o_z
+
+
+@njit_no_refcount(forceinline=True)
+def _clear_coat_shares(o_z: float, bsdf: Bsdf, tables: AlbedoTables) -> tuple[float, float]:
+    """Return the share of light that the clear coat reflects, and the probability of a sample of it."""
+    reflected = bsdf.clear_coat * table_value(tables.clear_coat_albedo, o_z, bsdf.clear_coat_roughness)
+    red, green, blue = bsdf.rgb
+    below = (1.0 - reflected) * max((red + green + blue) / 3.0, 0.04)
+    return reflected, min(max(reflected / (reflected + below), 0.1), 0.9)
+
+
+@njit_no_refcount(forceinline=True)
+def principled_eval(o: Vec3, i: Vec3, bsdf: Bsdf, tables: AlbedoTables) -> tuple[float, float, float, float]:
+    """Return value times cosine (three channels) and density of the material with its clear coat."""
+    f_r, f_g, f_b, pdf = _base_eval(o, i, bsdf, tables)
+    o_x, o_y, o_z = o
+    i_x, i_y, i_z = i
+    if bsdf.clear_coat <= 0.0 or o_z <= 0.0 or i_z <= 0.0:
+        return f_r, f_g, f_b, pdf
+    alpha = max(bsdf.clear_coat_roughness * bsdf.clear_coat_roughness, MIN_ALPHA)
+    h_x, h_y, h_z = o_x + i_x, o_y + i_y, o_z + i_z
+    length = math.sqrt(h_x * h_x + h_y * h_y + h_z * h_z)
+    fresnel, _ = fresnel_dielectric((o_x * h_x + o_y * h_y + o_z * h_z) / length, CLEAR_COAT_IOR)
+    # D G1(o) / (4 o_z): the density of the coat's samples
+    density = ggx_density(h_z / length, alpha) * ggx_masking(o_z, alpha) / (4.0 * o_z)
+    coat = bsdf.clear_coat * fresnel * density * ggx_masking(i_z, alpha)
+    reflected, share = _clear_coat_shares(o_z, bsdf, tables)
+    left = 1.0 - reflected
+    return (
+        left * f_r + coat, left * f_g + coat, left * f_b + coat, share * density + (1.0 - share) * pdf
+    )  # fmt: skip
+
+
+@njit_no_refcount(forceinline=True)
+def principled_sample(o: Vec3, bsdf: Bsdf, tables: AlbedoTables, choice: float, u: float, v: float) -> Vec3:
+    """Draw a direction to the light, as dense as :func:`principled_eval` says; worth 0 below the surface."""
+    if bsdf.clear_coat > 0.0:
+        _, share = _clear_coat_shares(o[2], bsdf, tables)
+        if choice < share:
+            alpha = max(bsdf.clear_coat_roughness * bsdf.clear_coat_roughness, MIN_ALPHA)
+            return _sample_reflection(o, alpha, u, v)
+        choice = (choice - share) / (1.0 - share)
+    return _base_sample(o, bsdf, tables.coat_albedo, choice, u, v)
 
 
 @njit_no_refcount(forceinline=True)

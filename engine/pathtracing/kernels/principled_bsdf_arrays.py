@@ -18,7 +18,7 @@ from octasplat.engine.trace.kernels.native import njit_no_refcount
 class BsdfArrays(NamedTuple):
     """Materials of ``n`` points, as in :class:`octasplat.engine.pathtracing.kernels.kernel_args.Bsdf`.
 
-    A single index of refraction, substrate and choice of compensation stands for all.
+    A single index of refraction, substrate, choice of compensation and clear coat stands for all.
     """
 
     rgb: Float64[np.ndarray, "n 3"]
@@ -27,13 +27,18 @@ class BsdfArrays(NamedTuple):
     ior: float
     substrate: int
     energy_compensation: bool
+    clear_coat: float
+    clear_coat_roughness: float
 
 
 @njit_no_refcount(forceinline=True)
 def bsdf_row(bsdf: BsdfArrays, n: int) -> Bsdf:
     """Return the material of point ``n``."""
     rgb = bsdf.rgb[n, 0], bsdf.rgb[n, 1], bsdf.rgb[n, 2]
-    return Bsdf(rgb, bsdf.metallic[n], bsdf.roughness[n], bsdf.ior, bsdf.substrate, bsdf.energy_compensation)
+    return Bsdf(
+        rgb, bsdf.metallic[n], bsdf.roughness[n], bsdf.ior, bsdf.substrate, bsdf.energy_compensation,
+        bsdf.clear_coat, bsdf.clear_coat_roughness,
+    )  # fmt: skip
 
 
 @kernel(_nrt=False, error_model="numpy")
@@ -59,14 +64,14 @@ def principled_sample_array(
     last: int,
     o: Float64[np.ndarray, "n 3"],
     bsdf: BsdfArrays,
-    coat_albedo: Float64[np.ndarray, "a c"],
+    tables: AlbedoTables,
     random_numbers: Float64[np.ndarray, "n 3"],
     i: Float64[np.ndarray, "n 3"],
 ) -> None:
     """Write :func:`principled_sample` of the rows ``first`` to ``last`` to ``i``."""
     for n in range(first, last):
         i[n, 0], i[n, 1], i[n, 2] = principled_sample(
-            (o[n, 0], o[n, 1], o[n, 2]), bsdf_row(bsdf, n), coat_albedo,
+            (o[n, 0], o[n, 1], o[n, 2]), bsdf_row(bsdf, n), tables,
             random_numbers[n, 0], random_numbers[n, 1], random_numbers[n, 2],
         )  # fmt: skip
 

@@ -123,7 +123,7 @@ def draw_light(lights: LightArrays, point: Vec3, samples: PathSamples) -> LightS
     """Choose a light for a point, and a place on it."""
     x, y, z = point
     if len(lights.kinds):
-        l, share = sample_light_index(lights, x, y, z, sample_pair(samples, LIGHT_CHOICE_SAMPLE)[0])
+        l, share = sample_light_index(lights, x, y, z, sample_pair(samples, LIGHT_CHOICE_SAMPLE)[0], True)
         if l >= 0:
             u, v = sample_pair(samples, LIGHT_POSITION_SAMPLE)
             w_x, w_y, w_z, distance, red, green, blue, pdf = sample_light(lights, l, x, y, z, u, v)
@@ -201,6 +201,8 @@ def scatter_path(
             l_pdf *= share
             # balance heuristic, where both ways can find the light
             factor = 1.0 / (l_pdf + pdf) if lights.is_hittable[l] else 1.0 / l_pdf
+        # nothing is in the way of what casts no shadows
+        distance = distance if lights.casts_shadows[l] else 0.0
         w = paths.throughput[p]
         radiance = w[0] * f_r * l_r * factor, w[1] * f_g * l_g * factor, w[2] * f_b * l_b * factor
         clamp = query.integrator.clamp if paths.flags[p] & FLAG_SCATTERED else np.inf
@@ -211,7 +213,7 @@ def scatter_path(
         i_x, i_y, i_z = sample_cosine(u, v)
     else:
         choice = sample_pair(samples, LOBE_SAMPLE)[0]
-        i_x, i_y, i_z = principled_sample(o, bsdf, tables.coat_albedo, choice, u, v)
+        i_x, i_y, i_z = principled_sample(o, bsdf, tables, choice, u, v)
     f_r, f_g, f_b, pdf = surface_eval(o, (i_x, i_y, i_z), is_diffuse, bsdf, tables)
     w_x = i_x * a_x + i_y * b_x + i_z * s_x
     w_y = i_x * a_y + i_y * b_y + i_z * s_y

@@ -48,6 +48,18 @@ class Cutout(StageModel):
     opacity_cutoff: NonNegative | None = None
 
 
+class ClearCoated(StageModel):
+    """A surface that may have a clear coat of index 1.5 over all else, such as lacquer on metal.
+
+    Attributes:
+        clear_coat: share of the surface that has it.
+        clear_coat_roughness: perceptual, GGX's alpha is its square.
+    """
+
+    clear_coat: UnitInterval = 0.0
+    clear_coat_roughness: UnitInterval = 0.0
+
+
 class Diffuse(NormalMapped, Emissive, Cutout):
     """A diffuse (Lambertian) surface.
 
@@ -87,7 +99,7 @@ class Glass(StageModel):
     multiple_scattering: bool = True
 
 
-class Metal(NormalMapped):
+class Metal(NormalMapped, ClearCoated):
     """Metal with a microfacet surface (GGX).
 
     Attributes:
@@ -102,7 +114,7 @@ class Metal(NormalMapped):
     multiple_scattering: bool = True
 
 
-class Dielectric(NormalMapped, Emissive, Cutout):
+class Dielectric(NormalMapped, Emissive, Cutout, ClearCoated):
     """A colored substrate under a clear coat with a microfacet surface, such as plastic or glaze.
 
     Attributes:
@@ -119,7 +131,7 @@ class Dielectric(NormalMapped, Emissive, Cutout):
     ior: Annotated[float, Field(gt=1, le=4)] = 1.5
 
 
-class MetallicRoughness(NormalMapped, Emissive, Cutout):
+class MetallicRoughness(NormalMapped, Emissive, Cutout, ClearCoated):
     """glTF's material: a mixture of a dielectric and a metal.
 
     Attributes:

@@ -100,15 +100,23 @@ class LightModel(StageModel):
         color_srgb: of the light.
         adds_light: whether it adds its light to shadowed Gaussians. Otherwise their colors hold it already,
             and they only lose it where something new is in its way.
+        lights_meshes: whether it lights meshes, and Gaussians with materials; it is seen all the same.
+        casts_shadows: whether anything keeps it off. Without shadows it takes nothing from Gaussians.
+        only_shadows: it is not seen and lights nothing; only its shadows fall on shadowed Gaussians.
         keys: where it is in single images of a film.
     """
 
     color_srgb: Color = WHITE
     adds_light: bool = False
+    lights_meshes: bool = True
+    casts_shadows: bool = True
+    only_shadows: bool = False
     keys: Keys[LightKey] = ()
 
     @model_validator(mode="after")
     def _check_keys(self) -> "LightModel":
+        if self.only_shadows and (self.adds_light or not self.casts_shadows):
+            raise ValueError("a light of only_shadows casts shadows and adds no light; leave out the others")
         check_keys(self.keys, tuple(type(self).model_fields))
         return self
 
