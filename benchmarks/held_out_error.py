@@ -24,7 +24,14 @@ from jaxtyping import Float32
 
 from benchmarks.picture_measures import BAND_NAMES, measure_pair
 from benchmarks.view_colors import fitted_colors_picture, nearest_directions, with_frozen_colors
-from benchmarks.view_support import (
+from octasplat.engine.core.color import composite_over
+from octasplat.engine.core.psnr import psnr
+from octasplat.engine.core.rays import ImageRays
+from octasplat.engine.core.threads import threads_in_use, use_threads
+from octasplat.engine.core.writing import write_json
+from octasplat.engine.dataset import Dataset
+from octasplat.engine.evaluate.metrics import quantize_8_bit
+from octasplat.engine.evaluate.view_support import (
     GROUP_NAMES,
     PointDepths,
     Support,
@@ -34,13 +41,6 @@ from benchmarks.view_support import (
     measure_support,
     psnr_of,
 )
-from octasplat.engine.core.color import composite_over
-from octasplat.engine.core.psnr import psnr
-from octasplat.engine.core.rays import ImageRays
-from octasplat.engine.core.threads import threads_in_use, use_threads
-from octasplat.engine.core.writing import write_json
-from octasplat.engine.dataset import Dataset
-from octasplat.engine.evaluate.metrics import quantize_8_bit
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
 from octasplat.engine.gaussians.materials import has_materials
 from octasplat.engine.gaussians.model import FlatGaussians

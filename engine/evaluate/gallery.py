@@ -89,7 +89,7 @@ def embedded_names(worst_first: list[str], images: Mapping[str, ViewImages]) -> 
     return known if len(known) <= WORST_COUNT + BEST_COUNT else [*known[:WORST_COUNT], *known[-BEST_COUNT:]]
 
 
-def magma(values: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w 3"]:
+def magma(values: Float32[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*shape 3"]:
     """Return colors of errors in [0, 1], from black over purple and orange to pale yellow."""
     steps = np.linspace(0, 1, len(MAGMA))
     return np.stack([np.interp(values, steps, MAGMA[:, k]) for k in range(3)], axis=-1).astype(np.float32)

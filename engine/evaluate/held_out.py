@@ -6,15 +6,17 @@ from dataclasses import replace
 from pathlib import Path
 
 import numba
+import numpy as np
 
 from octasplat.engine.core.color import composite_over
 from octasplat.engine.core.events import EventListener, PhaseProgress, Warned, read_events
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset import Dataset
+from octasplat.engine.evaluate.advice import ViewFacts, advise, fine_detail, support_groups
 from octasplat.engine.evaluate.gallery import ViewImages, WorstAndBestViews
 from octasplat.engine.evaluate.ground_truth import GroundTruth
 from octasplat.engine.evaluate.ground_truth_measures import GroundTruthMeasures
-from octasplat.engine.evaluate.layer_display import display_environment, display_layers
+from octasplat.engine.evaluate.layer_display import COVERAGE, display_environment, display_layers
 from octasplat.engine.evaluate.other_world import OtherWorldCheck
 from octasplat.engine.evaluate.report import write_report
 from octasplat.engine.evaluate.view_metrics import (
@@ -25,6 +27,7 @@ from octasplat.engine.evaluate.view_metrics import (
     measure_view,
     summarize_views,
 )
+from octasplat.engine.evaluate.view_support import coverage_picture, grid_stride, measure_support
 from octasplat.engine.gaussians.materials import ALBEDO
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.pathtracing.environment import EnvironmentMap
@@ -36,8 +39,10 @@ from octasplat.engine.render.supersampling import RADIANCE_RAYS_PER_SIDE, render
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import Tracer, TraceSettings
-from octasplat.engine.train.shading_factory import find_background, shading_for_view
+from octasplat.engine.train.shading_factory import find_background, find_exposures, shading_for_view
 
+MAX_COVERAGE_VIEWS = 24
+"""Held-out views whose coverage is measured."""
 RENDERS, LAYERS, METRICS, REPORT = "renders", "layers", "metrics.json", "report.html"
 
 
@@ -84,6 +89,7 @@ def evaluate_held_out(
     if check is not None:
         warnings = _as_warnings(check.warn_of_cameras(dataset.viewpoints, gaussians), progress)
     rows: list[ViewMetrics] = []
+    facts: dict[str, ViewFacts] = {}
     images = WorstAndBestViews()
     photographs = [view.name for view in dataset.views]
     names = dict(zip(photographs, unique_render_names(photographs), strict=True))
@@ -92,6 +98,11 @@ def evaluate_held_out(
     ):
         _write_images(view, output, names[view.name])
         rows.append(measured.metrics)
+        facts[view.name] = ViewFacts(
+            fine_detail(view.reference, view.weight),
+            fine_detail(view.render, view.weight),
+            view.support,
+        )
         if check is not None:
             check.add(view, measured.metrics.psnr)
         images.offer(
@@ -110,7 +121,15 @@ def evaluate_held_out(
     if environment is not None:
         write_png(output / LAYERS / "environment.png", display_environment(environment.radiance_linear))
     behind = find_background(shading)
-    metrics = summarize_views(rows).as_dict(run)
+    advice = advise(
+        rows,
+        facts,
+        training_psnr=_training_psnr(run),
+        learns_exposure=find_exposures(shading) is not None,
+    )
+    told = {"advice": list(advice)} if advice else {}
+    covered = {"coverage": groups} if (groups := support_groups(facts)) else {}
+    metrics = summarize_views(rows).as_dict({**run, **covered, **told})
     write_json(output / METRICS, metrics)
     write_report(
         output / REPORT,
@@ -124,10 +143,18 @@ def evaluate_held_out(
     )
 
 
+def _training_psnr(run: Mapping[str, object]) -> float | None:
+    known = run.get("training_views")
+    value = known.get("psnr") if isinstance(known, Mapping) else None
+    return float(value) if isinstance(value, int | float) else None
+
+
 def _write_images(view: RenderedView, output: Path, name: str) -> None:
     write_png(output / RENDERS / f"{name}.png", view.render)
     if ALBEDO in view.layers:
         for layer, display in view.layers.items():
+            if layer == COVERAGE:
+                continue
             write_png(output / LAYERS / layer / f"{name}.png", display)
 
 
@@ -147,6 +174,7 @@ def _render_views(
     measures: GroundTruthMeasures | None,
 ) -> Iterator[RenderedView]:
     color = background_color(background)
+    asked = _views_to_ask(dataset)
     for index in dataset.test_indices:
         rgb, alpha, weight = dataset.view_image(int(index))
         rays = dataset.view_rays(int(index))
@@ -158,15 +186,32 @@ def _render_views(
             view = dataset.views[index]
             measures.add(view.name, image, rays, view.rotation_cam_from_world[2])
         reference = composite_over(rgb, alpha, color)
+        layers, support = display_layers(image), None
+        if int(index) in asked:
+            height, width = weight.shape
+            stride = grid_stride(width, height)
+            error = ((image.rgb_srgb - reference).astype(np.float64) ** 2).mean(axis=2)
+            support = measure_support(dataset, tracer, rays, image.depth_median, error, weight, stride)
+            layers[COVERAGE] = coverage_picture(support, width, height, stride)
         yield RenderedView(
             name=dataset.views[index].name,
             render=image.rgb_srgb,
             reference=reference,
             weight=weight,
             alpha=alpha if dataset.has_alpha else None,
-            layers=display_layers(image),
+            layers=layers,
+            support=support,
             depth_spread=depth_spread(image.depth, image.depth_median, weight),
         )
+
+
+def _views_to_ask(dataset: Dataset) -> set[int]:
+    """Return the held-out views whose coverage by training views is measured, evenly chosen among many."""
+    if len(dataset.train_indices) == 0:
+        return set()
+    count = min(len(dataset.test_indices), MAX_COVERAGE_VIEWS)
+    places = np.linspace(0, len(dataset.test_indices) - 1, count).round().astype(np.int64)
+    return set(dataset.test_indices[places].tolist())
 
 
 def _measure_views(

@@ -10,6 +10,8 @@ from octasplat.engine.render.renderer import RenderedImage
 
 MIN_ALPHA = 0.5
 FAR_GRAY = 0.15
+COVERAGE = "coverage"
+"""Layer that shows how many training views see each place."""
 LABELS: Mapping[str, str] = {
     "normal": "Normal",
     "depth": "Depth",
@@ -18,6 +20,7 @@ LABELS: Mapping[str, str] = {
     "roughness": "Roughness",
     "visibility": "Visibility",
     "indirect": "Indirect",
+    COVERAGE: "Coverage",
 }
 """Layers by name, in the order in which they are offered."""
 

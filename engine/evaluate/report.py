@@ -163,8 +163,13 @@ def _template_values(
             *_as_mapping(metrics.get("definitions")).items(),
             *_as_mapping(_as_mapping(metrics.get("truth")).get("definitions")).items(),
         ],
+        "advice": [str(line) for line in _as_list(metrics.get("advice"))],
         "warnings": list(dict.fromkeys(str(e.get("message")) for e in events if e.get("kind") == "warning")),
     }
+
+
+def _as_list(value: object) -> Sequence[object]:
+    return value if isinstance(value, list | tuple) else ()
 
 
 def _embedded_map(rgb_srgb: Float32[np.ndarray, "h w 3"]) -> dict[str, object]:

@@ -72,6 +72,7 @@ def summarize_run(output: Path, exports: Iterable[str]) -> list[str]:
         f"{metrics['gaussians']:,} Gaussians after {metrics['iterations']:,} iterations, "
         f"trained in {format_duration(metrics['seconds'])}",
         *_place(metrics),
+        *metrics.get("advice", ())[:1],
         *(f"{label + ':':10}{output / name}" for label, name in files if (output / name).exists()),
         f"{'In 3D:':10}octasplat view {shlex.quote(str(output))}",
     ]

@@ -19,6 +19,7 @@ from octasplat.engine.evaluate.metrics import (
     quantize_8_bit,
     ssim_both,
 )
+from octasplat.engine.evaluate.view_support import Support
 
 FOREGROUND_ALPHA = 0.5
 BOOTSTRAP_DRAWS = 2000
@@ -39,6 +40,7 @@ class RenderedView(NamedTuple):
         alpha: Coverage of the photograph's foreground, for photographs that have one.
         layers: What lies behind the render, as display values by name.
         depth_spread: See :func:`depth_spread`; ``None`` where depths are not known.
+        support: Training views that see what it shows; ``None`` where that was not asked.
     """
 
     name: str
@@ -48,6 +50,7 @@ class RenderedView(NamedTuple):
     alpha: Float32[np.ndarray, "h w"] | None = None
     layers: Mapping[str, Float32[np.ndarray, "h w 3"]] = MappingProxyType({})
     depth_spread: float | None = None
+    support: Support | None = None
 
 
 @dataclass(frozen=True)

@@ -129,6 +129,8 @@ def add_scenes(folder: Path, run: Path, words: Sequence[str]) -> None:
         shutil.copy(run / "scene.ply", folder / name)
     for name in ("edited.ply", "part.ply", "frames/0.ply", "frames/1.ply"):
         shutil.copy(run / "mesh.ply", folder / name)
+    if any(word.startswith("THINGS/") for word in words):  # of a benchmark, which takes minutes
+        shutil.copytree(folder / "SCENE", folder / "THINGS" / "kettle")
     mask = np.zeros((36, 48, 3), np.float32)
     mask[6:30, 8:40] = 1
     if "--masks" in words:

@@ -8,9 +8,9 @@ import pytest
 
 from benchmarks.held_out_error import ROWS, main, table
 from benchmarks.view_colors import fitted_colors_picture, nearest_directions, with_frozen_colors
-from benchmarks.view_support import GROUP_NAMES, Support, gain_if_covered, group_errors, sees
 from octasplat import reconstruct
 from octasplat.engine.core.psnr import psnr
+from octasplat.engine.evaluate.view_support import GROUP_NAMES, Support, gain_if_covered, group_errors, sees
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
 from octasplat.engine.gaussians.spherical_harmonics import sh_basis
 from octasplat.engine.render.pinhole_camera import PinholeCamera
@@ -82,7 +82,7 @@ def test_a_wall_hides_what_is_behind_it():
 
 
 def test_errors_are_grouped_by_views():
-    support = Support(np.array([-1, 0, 2, 2, 40]), np.array([0.5, 0.1, 0.01, 0.03, 0.01]))
+    support = Support(np.arange(5), np.array([-1, 0, 2, 2, 40]), np.array([0.5, 0.1, 0.01, 0.03, 0.01]))
     found = group_errors([support])
     assert set(found) == {"nothing met", "0", "2", GROUP_NAMES[-1]}
     assert found["2"]["pixels"] == pytest.approx(0.4)

@@ -1,5 +1,6 @@
 """What training views say of a held-out view: how many see each place, and whether its depth is right."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ from scipy.ndimage import uniform_filter
 from octasplat.engine.core.rays import ImageRays, RayBatch
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.dataset.view_frusta import cam_from_world, is_in_image
+from octasplat.engine.evaluate.gallery import magma
 from octasplat.engine.trace.protocol import Tracer
 
 MAX_ANGLE_DEG = 15.0
@@ -23,6 +25,11 @@ FEW_VIEWS = 3
 DEPTH_TOLERANCE = 0.03
 """Share of its distance by which the depth of a sparse point is wrong."""
 AROUND_PX = 5
+MAX_POINTS = 3000
+"""Pixels of a view that are asked."""
+DARK_FROM = 9
+"""Training views from which on a place counts as well covered on a map."""
+UNKNOWN_GRAY = 0.25
 
 
 @dataclass(frozen=True)
@@ -30,13 +37,21 @@ class Support:
     """Pixels of a view on a grid.
 
     Attributes:
+        pixels: their numbers, row by row over the whole view.
         counts: training views that see the place which each pixel shows, within :data:`MAX_ANGLE_DEG`; -1
             where it shows none.
         errors: the pixels' squared errors, means over the channels.
     """
 
+    pixels: Int64[np.ndarray, " p"]
     counts: Int64[np.ndarray, " p"]
     errors: Float64[np.ndarray, " p"]
+
+    @property
+    def few_fraction(self) -> float:
+        """Return the share of the pixels that show something which fewer than three training views see."""
+        few = (self.counts >= 0) & (self.counts < FEW_VIEWS)
+        return float(few.mean()) if len(few) else 0.0
 
 
 @dataclass(frozen=True)
@@ -94,7 +109,28 @@ def measure_support(
         asked = asked[inside]
         if len(asked):
             counts[asked] += sees(tracer, view.origin_world, points[asked])
-    return Support(counts, squared_error.reshape(-1)[rows])
+    return Support(rows, counts, squared_error.reshape(-1)[rows])
+
+
+def grid_stride(width_px: int, height_px: int) -> int:
+    """Return the pixels between two that are asked, so that a view has about :data:`MAX_POINTS` of them."""
+    return max(1, math.ceil(math.sqrt(width_px * height_px / MAX_POINTS)))
+
+
+def coverage_picture(
+    support: Support, width_px: int, height_px: int, stride: int
+) -> Float32[np.ndarray, "h w 3"]:
+    """Return a map of the counts: bright where no training view sees a place, dark from nine on.
+
+    Gray where the view shows nothing, or was not asked.
+    """
+    rows, columns = np.divmod(support.pixels, width_px)
+    few = 1.0 - np.clip(support.counts, 0, DARK_FROM) / DARK_FROM
+    shape = (-(-height_px // stride), -(-width_px // stride))
+    grid = np.full((*shape, 3), UNKNOWN_GRAY, np.float32)
+    shown = support.counts >= 0
+    grid[rows[shown] // stride, columns[shown] // stride] = magma(few[shown].astype(np.float32))
+    return np.repeat(np.repeat(grid, stride, axis=0), stride, axis=1)[:height_px, :width_px]
 
 
 def sees(
@@ -102,7 +138,9 @@ def sees(
 ) -> Bool[np.ndarray, " n"]:
     """Return to which points at least half of the light of a viewer comes."""
     rays = RayBatch.between(viewer_world[None], points_world)
-    return np.asarray(tracer.transmittance(rays.with_t_max(np.float32(REACHED) * rays.t_max)) > 0.5)
+    # As whole traces, whose kernels are compiled already.
+    found = tracer.trace(rays.with_t_max(np.float32(REACHED) * rays.t_max))
+    return np.asarray(found.transmittance > 0.5)
 
 
 def measure_points(

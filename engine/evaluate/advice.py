@@ -1,0 +1,147 @@
+"""What would help a finished run, told by its measurements: sentences for the report."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32
+from scipy.ndimage import laplace
+
+from octasplat.engine.evaluate.view_metrics import ViewMetrics
+from octasplat.engine.evaluate.view_support import GROUP_NAMES, Support, gain_if_covered, group_errors
+
+MIN_COVERAGE_GAIN_DB = 0.5
+"""What more photographs of badly covered places would have to gain to be asked for."""
+MOSTLY_UNCOVERED = 0.8
+"""Share of badly covered pixels above which the rest is too little to compare with."""
+MIN_EXPOSURE_GAIN_DB = 1.0
+"""Gain of a single view by a correction of its colors, beyond that of most, from which on it is named."""
+MIN_EXPOSURE_VIEWS = 3
+MAX_SHARPNESS = 0.5
+"""A photograph is blurred that has less than this share of the fine detail of its render, and of others."""
+WELL_FITTED_DB = 1.0
+"""Training views that are shown no better than this beyond held-out ones are not fitted to their end."""
+OVERFITTED_DB = 3.0
+"""From this difference on a longer training gains little on new views."""
+GOOD_PSNR = 33.0
+"""Training views from which on more fit is not asked for."""
+_MAX_NAMES = 3
+_FEW_NAMES = GROUP_NAMES[:3]
+
+
+@dataclass(frozen=True)
+class ViewFacts:
+    """What advice goes by beside the metrics of a held-out view.
+
+    Attributes:
+        photograph_detail: of the photograph, see :func:`fine_detail`.
+        render_detail: of its render.
+        support: training views that see its places; None where that was not asked.
+    """
+
+    photograph_detail: float
+    render_detail: float
+    support: Support | None = None
+
+
+def fine_detail(picture: Float32[np.ndarray, "h w 3"], weight: Float32[np.ndarray, "h w"]) -> float:
+    """Return the mean power of the Laplacian of a picture's gray values, over the pixels that count."""
+    valid = weight > 0
+    return float((laplace(picture.mean(axis=2))[valid] ** 2).mean()) if valid.any() else 0.0
+
+
+def advise(
+    views: Sequence[ViewMetrics],
+    facts: Mapping[str, ViewFacts],
+    *,
+    training_psnr: float | None,
+    learns_exposure: bool,
+) -> tuple[str, ...]:
+    """Return what would help most, in sentences; none where nothing stands out.
+
+    Args:
+        views: metrics of the held-out views.
+        facts: of the same views by name.
+        training_psnr: mean PSNR of the training views in dB, where it is known.
+        learns_exposure: whether the exposures of the photographs were learnt.
+    """
+    told = []
+    coverage = _about_coverage(facts)
+    if coverage is not None:
+        told.append(coverage)
+    changed = _of_other_colors(views)
+    if changed:
+        names = _name_list([view.name for view in changed])
+        ways = "Lock exposure and white balance of the camera" + (
+            "." if learns_exposure else ", or let the training learn them (--set exposure=true)."
+        )
+        told.append(f"{len(changed)} held-out photographs have other colors than the rest ({names}). {ways}")
+    usual = float(np.median([known.photograph_detail for known in facts.values()])) if facts else 0.0
+    blurred = [
+        name
+        for name, known in facts.items()
+        if known.photograph_detail < MAX_SHARPNESS * min(known.render_detail, usual)
+    ]
+    if blurred:
+        told.append(
+            f"{len(blurred)} held-out photographs are less sharp than their renders ({_name_list(blurred)}). "
+            "Leave blurred photographs out."
+        )
+    finite = [view.psnr for view in views if np.isfinite(view.psnr)]
+    if training_psnr is not None and finite:
+        told += _about_fit(training_psnr, float(np.mean(finite)), is_covered=coverage is None)
+    return tuple(told)
+
+
+def _of_other_colors(views: Sequence[ViewMetrics]) -> list[ViewMetrics]:
+    """Return the views that a correction of colors makes better than it does the others."""
+    gains_db = np.array([view.psnr_colour_corrected - view.psnr for view in views])
+    finite = gains_db[np.isfinite(gains_db)]
+    if len(finite) < MIN_EXPOSURE_VIEWS:
+        return []
+    least_db = max(0.0, float(np.median(finite))) + MIN_EXPOSURE_GAIN_DB
+    return [view for view, gain_db in zip(views, gains_db, strict=True) if gain_db >= least_db]
+
+
+def support_groups(facts: Mapping[str, ViewFacts]) -> dict[str, dict[str, float]]:
+    """Return the groups of :func:`octasplat.engine.evaluate.view_support.group_errors`; empty if unknown."""
+    parts = [known.support for known in facts.values() if known.support is not None]
+    return group_errors(parts) if parts else {}
+
+
+def _about_coverage(facts: Mapping[str, ViewFacts]) -> str | None:
+    groups = support_groups(facts)
+    pixels, error = (
+        sum(groups[name][key] for name in _FEW_NAMES if name in groups) for key in ("pixels", "error")
+    )
+    # Where next to nothing is covered, nothing shows how good that would be.
+    gain_db = gain_if_covered(groups) if pixels <= MOSTLY_UNCOVERED else None
+    if pixels <= MOSTLY_UNCOVERED and (gain_db is None or gain_db < MIN_COVERAGE_GAIN_DB):
+        return None
+    gain = "" if gain_db is None else f" Covered as the others are, PSNR would be {gain_db:.1f} dB higher."
+    known = {name: each.support for name, each in facts.items() if each.support is not None}
+    worst = sorted(known, key=lambda name: -known[name].few_fraction)
+    return (
+        f"More photographs would help: {100 * pixels:.0f} % of the held-out pixels show places that at most "
+        f"two training photographs see from about there (within 15 degrees); {100 * error:.0f} % of the "
+        f"error lies in them.{gain} Take more around these views: {_name_list(worst)}"
+    )
+
+
+def _about_fit(training_psnr: float, held_out_psnr: float, *, is_covered: bool) -> list[str]:
+    difference_db = training_psnr - held_out_psnr
+    if difference_db < WELL_FITTED_DB and training_psnr < GOOD_PSNR:
+        return [
+            f"Training views are shown hardly better than held-out ones ({difference_db:+.1f} dB): a longer "
+            "training or more Gaussians would help (--preset standard or high, --max-gaussians)."
+        ]
+    if difference_db > OVERFITTED_DB and is_covered:
+        return [
+            f"Training views are shown {difference_db:.1f} dB better than held-out ones: more photographs "
+            "help, a longer training hardly."
+        ]
+    return []
+
+
+def _name_list(names: Sequence[str]) -> str:
+    return ", ".join(names[:_MAX_NAMES]) + (", ..." if len(names) > _MAX_NAMES else "")
