@@ -123,8 +123,8 @@ def _about_coverage(facts: Mapping[str, ViewFacts]) -> str | None:
     worst = sorted(known, key=lambda name: -known[name].few_fraction)
     return (
         f"More photographs would help: {100 * pixels:.0f} % of the held-out pixels show places that at most "
-        f"two training photographs see from about there (within 15 degrees); {100 * error:.0f} % of the "
-        f"error lies in them.{gain} Take more around these views: {_name_list(worst)}"
+        f"two training photographs see from within 15 degrees, and {100 * error:.0f} % of the error lies "
+        f"there.{gain} Take more around these views: {_name_list(worst)}"
     )
 
 

@@ -45,6 +45,9 @@ DEFINITIONS: dict[str, str] = {
     "count, and in the neighbourhood of others they show what the reference shows",
     "training_views": "PSNR of the views that were trained on, on a fixed grid of 576 pixels of each, "
     "rendered as held-out ones are; misfits are views far worse than those around them",
+    "coverage": "pixels, squared error and PSNR by the number of training views that see what a pixel of a "
+    "held-out view shows from within 15 degrees; the map of it is bright where none does, dark from nine on",
+    "advice": "what would help most, by these measurements",
     "mean": "the mean of the per-view values, not of pooled errors, over the views that have a finite one",
     "mean_left_out": "how many views each mean leaves out: perfect ones, wholly masked ones, and those too "
     "small for the metric",
