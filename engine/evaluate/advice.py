@@ -1,4 +1,4 @@
-"""What would help a finished run, told by its measurements: sentences for the report."""
+"""What would help a finished run, by its measurements: sentences for the report."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -65,17 +65,19 @@ def advise(
         training_psnr: mean PSNR of the training views in dB, where it is known.
         learns_exposure: whether the exposures of the photographs were learnt.
     """
-    told = []
+    sentences = []
     coverage = _about_coverage(facts)
     if coverage is not None:
-        told.append(coverage)
+        sentences.append(coverage)
     changed = _of_other_colors(views)
     if changed:
         names = _name_list([view.name for view in changed])
         ways = "Lock exposure and white balance of the camera" + (
             "." if learns_exposure else ", or let the training learn them (--set exposure=true)."
         )
-        told.append(f"{len(changed)} held-out photographs have other colors than the rest ({names}). {ways}")
+        sentences.append(
+            f"{len(changed)} held-out photographs have other colors than the rest ({names}). {ways}"
+        )
     usual = float(np.median([known.photograph_detail for known in facts.values()])) if facts else 0.0
     blurred = [
         name
@@ -83,14 +85,14 @@ def advise(
         if known.photograph_detail < MAX_SHARPNESS * min(known.render_detail, usual)
     ]
     if blurred:
-        told.append(
+        sentences.append(
             f"{len(blurred)} held-out photographs are less sharp than their renders ({_name_list(blurred)}). "
             "Leave blurred photographs out."
         )
     finite = [view.psnr for view in views if np.isfinite(view.psnr)]
     if training_psnr is not None and finite:
-        told += _about_fit(training_psnr, float(np.mean(finite)), is_covered=coverage is None)
-    return tuple(told)
+        sentences += _about_fit(training_psnr, float(np.mean(finite)), is_covered=coverage is None)
+    return tuple(sentences)
 
 
 def _of_other_colors(views: Sequence[ViewMetrics]) -> list[ViewMetrics]:

@@ -127,9 +127,9 @@ def evaluate_held_out(
         training_psnr=_training_psnr(run),
         learns_exposure=find_exposures(shading) is not None,
     )
-    told = {"advice": list(advice)} if advice else {}
+    stated = {"advice": list(advice)} if advice else {}
     covered = {"coverage": groups} if (groups := support_groups(facts)) else {}
-    metrics = summarize_views(rows).as_dict({**run, **covered, **told})
+    metrics = summarize_views(rows).as_dict({**run, **covered, **stated})
     write_json(output / METRICS, metrics)
     write_report(
         output / REPORT,
