@@ -17,6 +17,7 @@ from octasplat.engine.pathtracing.kernels.kernel_args import (
     LightArrays,
     MaterialArrays,
     MeshQueries,
+    MeshScene,
     SurfaceArrays,
 )
 from octasplat.engine.pathtracing.kernels.surface import GLASS
@@ -86,6 +87,12 @@ class CompiledMeshes:
             self.triangles.closest_query, (self.covers or self.triangles).any_query, self.obstacles.any_query,
             self.filters.closest_query, self.filter_faces, self.covers is not None,
         )  # fmt: skip
+
+    @property
+    def scene(self) -> MeshScene:
+        """Return what the kernels know of the meshes and lights."""
+        nested = bool((self.materials.priorities >= 0).any())
+        return MeshScene(self.surfaces, self.materials, self.lights, self.lights.environment_id, nested)
 
     def with_lights(self, lights: LightArrays) -> "CompiledMeshes":
         """Return the same meshes with other lights and an environment that the camera does not see."""

@@ -42,6 +42,7 @@ _DEFAULTS: dict[str, np.ndarray] = {
     "roughness": np.array(0.0),
     "iors": np.array(1.5),
     "absorption": np.zeros(3),
+    "priorities": np.array(-1, np.int32),
     "substrates": np.array(COUPLED, np.int32),
     "energy_compensation": np.array(1, np.int32),
     "coat_tables": np.array(0, np.int32),
@@ -112,6 +113,8 @@ class MaterialTable:
             color = material.tint_srgb
             row |= {"kinds": GLASS, "iors": material.ior, "absorption": material.absorption}
             row |= {"roughness": material.roughness, "energy_compensation": material.multiple_scattering}
+            if material.priority is not None:
+                row["priorities"] = material.priority
             if material.roughness > 0.0 and material.ior > 1.0:
                 row["coat_tables"] = self._albedo_table_id("rough_dielectric", material.ior)
                 # of leaving, in the place behind that of entering

@@ -14,6 +14,7 @@ from octasplat.engine.pathtracing.kernels.path_args import (
     PathBlock,
     PathScratch,
     PathStart,
+    allocate_media,
     allocate_paths,
     allocate_shadow_rays,
 )
@@ -67,7 +68,7 @@ class Workspace:
         """Return buffers for :data:`PATHS_PER_THREAD` paths."""
         hits = MeshHits(
             np.empty(BLOCK_SIZE, np.float32), np.empty(BLOCK_SIZE, np.int32),
-            np.empty((BLOCK_SIZE, 2), np.float32),
+            np.empty((BLOCK_SIZE, 2), np.float32), allocate_media(BLOCK_SIZE),
         )  # fmt: skip
         block = PathBlock(
             np.empty(BLOCK_SIZE, np.int32), hits, allocate_shadow_rays(BLOCK_SIZE),

@@ -17,7 +17,7 @@ from octasplat.engine.pathtracing.denoising import load_denoiser
 from octasplat.engine.pathtracing.film import Film
 from octasplat.engine.pathtracing.gaussian_layers import GaussianLayers
 from octasplat.engine.pathtracing.kernels.camera_paths import start_paths
-from octasplat.engine.pathtracing.kernels.cutouts import pass_holes
+from octasplat.engine.pathtracing.kernels.cutouts import pass_surfaces
 from octasplat.engine.pathtracing.kernels.gaussian_layer import (
     LayerLight,
     add_layer_light,
@@ -27,7 +27,7 @@ from octasplat.engine.pathtracing.kernels.gaussian_surface import (
     intersect_gaussian_surfaces,
     start_paths_at_surfaces,
 )
-from octasplat.engine.pathtracing.kernels.kernel_args import IntegratorParameters, LayerArrays, MeshScene
+from octasplat.engine.pathtracing.kernels.kernel_args import IntegratorParameters, LayerArrays
 from octasplat.engine.pathtracing.kernels.path_args import (
     Bounce,
     CameraRays,
@@ -35,6 +35,7 @@ from octasplat.engine.pathtracing.kernels.path_args import (
     PathArrays,
     ShadowRayArrays,
     SurfaceInteractions,
+    allocate_media,
     allocate_path_scratch,
     allocate_paths,
     allocate_shadow_rays,
@@ -197,7 +198,7 @@ class PathTracer:
 
     def _trace_per_thread(self, film: Film, image: ImageBatches) -> Iterator[None]:
         """Trace paths among meshes only, a batch per thread; yield before each batch that is awaited."""
-        scene, queries = self._mesh_scene, self._scene.meshes.queries
+        scene, queries = self._scene.meshes.scene, self._scene.meshes.queries
         free: Queue[Workspace] = Queue()
         for scratch in self._scratches:
             free.put(Workspace.allocate(scratch))
@@ -274,7 +275,7 @@ class PathTracer:
 
         ``active`` are those that are left after ``first_depth`` bounces; None stands for all.
         """
-        meshes, layers, scene = self._scene.meshes, self._scene.layers, self._mesh_scene
+        meshes, layers, scene = self._scene.meshes, self._scene.layers, self._scene.meshes.scene
         active = np.arange(len(paths.keys), dtype=np.int32) if active is None else active
         for depth in range(first_depth, self._integrator.max_depth + 1):
             rays = RayBatch(
@@ -284,18 +285,18 @@ class PathTracer:
                 t_view_origin=0.0 if depth == 0 else paths.t_view_origin[active],
             )
             hits = meshes.triangles.closest(rays)
-            shadows = allocate_shadow_rays(len(active))
+            shadows, nested = allocate_shadow_rays(len(active)), len(active) if scene.any_nested else 0
             bounce = Bounce(
                 paths=paths,
                 active=active,
                 depth=depth,
-                hits=MeshHits(hits.distances, hits.faces, hits.barycentrics),
+                hits=MeshHits(hits.distances, hits.faces, hits.barycentrics, allocate_media(nested)),
                 scene=scene,
                 integrator=self._integrator,
                 shadows=shadows,
             )
-            if meshes.queries.any_cutout:
-                self._run_kernel(pass_holes, len(active), meshes.queries, bounce)
+            if meshes.queries.any_cutout or scene.any_nested:
+                self._run_kernel(pass_surfaces, len(active), meshes.queries, bounce)
             if layers is not None:
                 traced = layers.trace(rays, hits.distances)
                 layer = LayerArrays(
@@ -321,11 +322,6 @@ class PathTracer:
             active = active[paths.is_alive[active]]
             if len(active) == 0:
                 return
-
-    @property
-    def _mesh_scene(self) -> MeshScene:
-        meshes = self._scene.meshes
-        return MeshScene(meshes.surfaces, meshes.materials, meshes.lights, meshes.lights.environment_id)
 
     def _shadow_transmittance(
         self, shadows: ShadowRayArrays, *, passes_rough_glass: bool = False

@@ -200,6 +200,20 @@ def test_sphere_under_environment_matches_mitsuba(name: str, tmp_path: Path) -> 
     print(name, same(turned, tmp_path, [GROUND, bsdf], {"sky": sky}))  # noqa: T201
 
 
+def test_ball_of_glass_filled_with_water_matches_mitsuba(tmp_path: Path) -> None:
+    environment(tmp_path)
+    sky = {"type": "envmap", "filename": str(tmp_path / "sky.exr")}
+    shell = Glass(ior=1.5, priority=1)
+    inner = ball(Glass(ior=1.33, priority=2), 0.6).model_copy(update={"position": (0, -0.9, 0)})
+    theirs = [
+        {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0},
+        {"type": "dielectric", "int_ior": 1.33, "ext_ior": 1.5},
+    ]
+    stage = stage_of(FLOOR, ball(shell), inner, lights=(), env=Environment(file="sky.exr"))
+    turned = stage.model_copy(update={"up": (0.0, 1.0, 0.0)})
+    print("filled", same(turned, tmp_path, [GROUND, *theirs], {"sky": sky}))  # noqa: T201
+
+
 def test_textured_dielectric_matches_mitsuba(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     write_png(

@@ -10,6 +10,7 @@ from octasplat.engine.pathtracing.kernels.kernel_args import IntegratorParameter
 from octasplat.engine.pathtracing.kernels.path_args import (
     BLOCK_SIZE,
     CAMERA_SAMPLE_PAIRS,
+    MAX_NESTED,
     PathArrays,
     PathScratch,
     PathStart,
@@ -69,6 +70,8 @@ def reset_path(paths: PathArrays, k: int, origin: Vec3, direction: Vec3, flags: 
         paths.albedo_linear[k, channel], paths.normals_world[k, channel] = 0.0, 0.0
     paths.transmittance[k], paths.coverage[k], paths.mesh_visibility[k] = 1.0, 1.0, 0.0
     paths.pdf[k], paths.t_view_origin[k], paths.medium_ids[k] = 0.0, 0.0, -1
+    for place in range(MAX_NESTED):
+        paths.media[k, place] = -1
     paths.flags[k], paths.is_alive[k] = flags, True
 
 

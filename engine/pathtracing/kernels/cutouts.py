@@ -1,9 +1,10 @@
-"""Surfaces with holes: what of them is there, and rays that go on through what is not.
+"""Surfaces that rays pass: those with holes where nothing is there, and those of glass within other glass.
 
 A texture of opacities, as of a leaf, or one number, as of gauze. With a cutoff a place is there or not;
 without one its opacity is the probability with which a path meets it, and the share of light that it keeps
 off. A path passes what is not there as if there were no surface: its place, its direction and the number of
-surfaces that it has met stay as they are.
+surfaces that it has met stay as they are. So it passes surfaces of glass within glass that counts instead,
+see :mod:`octasplat.engine.pathtracing.kernels.nested_glass`.
 """
 
 import math
@@ -15,17 +16,22 @@ from octasplat.engine.pathtracing.kernels.kernel_args import (
     LightArrays,
     MaterialArrays,
     MeshQueries,
-    MeshScene,
 )
-from octasplat.engine.pathtracing.kernels.path_args import BLOCK_SIZE, Bounce, PathArrays, PathScratch
+from octasplat.engine.pathtracing.kernels.nested_glass import (
+    copy_media,
+    cross_surface,
+    is_hidden,
+    is_nested,
+)
+from octasplat.engine.pathtracing.kernels.path_args import BLOCK_SIZE, Bounce, PathScratch
 from octasplat.engine.pathtracing.kernels.sampler import uniform_pair
-from octasplat.engine.pathtracing.kernels.surface import interpolate_uv
+from octasplat.engine.pathtracing.kernels.surface import face_normal, interpolate_uv
 from octasplat.engine.pathtracing.kernels.texture import eval_texture
 from octasplat.engine.trace.kernels.native import njit_no_refcount
 from octasplat.engine.trace.kernels.triangles import TriangleHitArrays, TriangleRays, closest_hits
 
 MAX_CUTOUTS = 1024
-"""Surfaces with holes on one ray that have random numbers of their own."""
+"""Surfaces that one ray passes and that have random numbers of their own."""
 FIRST_CUTOUT_PAIR = 1 << 13
 """Pairs of numbers behind those of meshes and of Gaussians."""
 RESTART_SCALE = np.float32(1 + 1e-6)
@@ -58,9 +64,21 @@ def restart_distance(t: np.float32) -> np.float32:
 
 
 @njit_no_refcount(forceinline=True)
-def _is_hole(paths: PathArrays, p: int, scene: MeshScene, face: int, b: float, c: float, pair: int) -> bool:
-    """Return whether a path finds nothing at a place of a face, with its random number of a pair."""
+def _is_passed(bounce: Bounce, k: int, face: int, b: float, c: float, pair: int) -> bool:
+    """Return whether a path finds nothing at a place of a face, with its random number of a pair.
+
+    Glass within other glass is noted in the list of row ``k``.
+    """
+    paths, p, scene, media = bounce.paths, bounce.active[k], bounce.scene, bounce.hits.media
     m = scene.surfaces.material_ids[face]
+    if is_nested(scene.materials, m):
+        n_x, n_y, n_z = face_normal(scene.surfaces.corners_world[face])
+        d = paths.directions_world[p]
+        is_entering = d[0] * n_x + d[1] * n_y + d[2] * n_z <= 0.0
+        if not is_hidden(scene.materials, media[k], m, is_entering):
+            return False
+        cross_surface(media[k], m, is_entering)
+        return True
     if not has_holes(scene.materials, m):
         return False
     u, v = interpolate_uv(scene.surfaces.corner_uv[face], 1.0 - b - c, b, c)
@@ -71,13 +89,16 @@ def _is_hole(paths: PathArrays, p: int, scene: MeshScene, face: int, b: float, c
 
 
 @kernel(_nrt=False, error_model="numpy")
-def pass_holes(first: int, last: int, scratch: PathScratch, queries: MeshQueries, bounce: Bounce) -> None:
-    """Move the hits of the rows ``first`` to ``last`` from holes to what the rays meet behind them."""
+def pass_surfaces(first: int, last: int, scratch: PathScratch, queries: MeshQueries, bounce: Bounce) -> None:
+    """Move the hits of the rows ``first`` to ``last`` from what rays pass to what they meet behind it."""
     paths, active, hits, scene = bounce.paths, bounce.active, bounce.hits, bounce.scene
     met = TriangleHitArrays(scratch.distances, scratch.faces, scratch.barycentrics)
     rays = TriangleRays(
         scratch.origins, scratch.directions, scratch.t_starts, scratch.t_ends, scratch.rows[:0]
     )
+    if scene.any_nested:
+        for k in range(first, last):
+            copy_media(paths.media[active[k]], hits.media[k])
     for start in range(first, last, BLOCK_SIZE):
         pair = FIRST_CUTOUT_PAIR + bounce.depth * MAX_CUTOUTS
         count = 0
@@ -85,13 +106,13 @@ def pass_holes(first: int, last: int, scratch: PathScratch, queries: MeshQueries
             face = hits.faces[k]
             if face >= 0:
                 b, c = float(hits.barycentrics[k, 0]), float(hits.barycentrics[k, 1])
-                if _is_hole(paths, active[k], scene, face, b, c, pair):
+                if _is_passed(bounce, k, face, b, c, pair):
                     scratch.rows[count] = k
                     count += 1
         crossed = 0
         while count > 0:
             crossed = min(crossed + 1, MAX_CUTOUTS - 1)
-            # --- the rays go on behind the hole ---
+            # --- the rays go on behind the surface ---
             for i in range(count):
                 k = scratch.rows[i]
                 p = active[k]
@@ -101,7 +122,7 @@ def pass_holes(first: int, last: int, scratch: PathScratch, queries: MeshQueries
                 scratch.t_starts[i] = restart_distance(hits.distances[k])
                 scratch.t_ends[i] = math.inf
             closest_hits(queries.closest_hit, rays, 0, count, False, scratch.embree, met)
-            # --- those that meet a hole again stay in the list ---
+            # --- those that pass another one stay in the list ---
             left = 0
             for i in range(count):
                 k = scratch.rows[i]
@@ -111,7 +132,7 @@ def pass_holes(first: int, last: int, scratch: PathScratch, queries: MeshQueries
                 hits.faces[k], hits.distances[k] = face, scratch.distances[i]
                 b, c = float(scratch.barycentrics[i, 0]), float(scratch.barycentrics[i, 1])
                 hits.barycentrics[k, 0], hits.barycentrics[k, 1] = b, c
-                if face >= 0 and (is_same or _is_hole(paths, active[k], scene, face, b, c, pair + crossed)):
+                if face >= 0 and (is_same or _is_passed(bounce, k, face, b, c, pair + crossed)):
                     scratch.rows[left] = k
                     left += 1
             count = left

@@ -26,6 +26,7 @@ from octasplat.engine.pathtracing.kernels.lights import (
     sample_light,
     sample_light_index,
 )
+from octasplat.engine.pathtracing.kernels.nested_glass import copy_media
 from octasplat.engine.pathtracing.kernels.path_args import (
     CAMERA_SAMPLE_PAIRS,
     PATH_ENDED,
@@ -222,6 +223,8 @@ def intersect_gaussian_layers(
             first_pair = CAMERA_SAMPLE_PAIRS + depth * SAMPLE_PAIRS_PER_BOUNCE
             normal = layer.normals[k, 0], layer.normals[k, 1], layer.normals[k, 2]
             query = LightQuery(lights, integrator, shadows, k)
+            if scene.any_nested:
+                copy_media(paths.media[p], shadows.media[k])
             _query_layer_light(paths, p, first_pair, point, normal, (g_r, g_g, g_b), shares, query)
         # --- clear paths: layers are composited in display values ---
         if clear:

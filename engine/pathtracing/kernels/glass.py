@@ -3,7 +3,17 @@
 import math
 from typing import NamedTuple
 
+import numpy as np
+from jaxtyping import Int32
+
 from octasplat.engine.pathtracing.kernels.kernel_args import MaterialArrays, Rgb, SurfacePoint
+from octasplat.engine.pathtracing.kernels.nested_glass import (
+    AIR,
+    cross_surface,
+    index_of,
+    is_nested,
+    medium_of,
+)
 from octasplat.engine.pathtracing.kernels.path_args import LightQuery, PathArrays, PathSamples
 from octasplat.engine.pathtracing.kernels.principled_bsdf import fresnel_dielectric, orthonormal_basis
 from octasplat.engine.pathtracing.kernels.rough_dielectric import (
@@ -27,18 +37,51 @@ from octasplat.engine.trace.kernels.native import njit_no_refcount
 
 
 class Glass(NamedTuple):
-    """The glass that a path meets, row ``m`` of the materials, and whether the path comes from outside."""
+    """A surface of glass that a path meets.
+
+    Attributes:
+        materials: of the stage.
+        m: row of the glass in them.
+        is_entering: whether the path comes from outside.
+        eta: index of refraction on the far side over that on the viewer's.
+        medium: on the far side, -1 for air.
+        is_in_air: whether there is air on one side.
+    """
 
     materials: MaterialArrays
     m: int
     is_entering: bool
+    eta: float
+    medium: int
+    is_in_air: bool
 
 
 @njit_no_refcount(forceinline=True)
-def relative_ior(glass: Glass) -> float:
-    """Return the index of refraction on the far side over that on the viewer's."""
-    ior = glass.materials.iors[glass.m]
-    return ior if glass.is_entering else 1.0 / ior
+def glass_surface(
+    materials: MaterialArrays, m: int, is_entering: bool, media: Int32[np.ndarray, " d"]
+) -> Glass:
+    """Return the surface of glass ``m`` for a path that is inside ``media``."""
+    other = AIR
+    if is_nested(materials, m):
+        if is_entering:
+            other = medium_of(materials, media)
+        else:
+            # what is left once this one is taken out
+            cross_surface(media, m, False)
+            other = medium_of(materials, media)
+            cross_surface(media, m, True)
+    ior, around = materials.iors[m], index_of(materials, other)
+    eta = ior / around if is_entering else around / ior
+    medium = int(m) if is_entering else other
+    return Glass(materials, m, is_entering, eta, medium, other < 0)
+
+
+@njit_no_refcount(forceinline=True)
+def _enter_far_side(paths: PathArrays, p: int, glass: Glass) -> None:
+    """Note that a path goes through a surface of glass."""
+    paths.medium_ids[p] = glass.medium
+    if is_nested(glass.materials, glass.m):
+        cross_surface(paths.media[p], glass.m, glass.is_entering)
 
 
 @njit_no_refcount(forceinline=True)
@@ -70,8 +113,7 @@ def scatter_smooth_glass(
     """Reflect a path at glass or let it through, by chance as Fresnel says."""
     (x, y, z), (n_x, n_y, n_z), (s_x, s_y, s_z) = point
     d = paths.directions_world[p]
-    materials, m, is_entering = glass
-    eta = relative_ior(glass)
+    materials, m, eta = glass.materials, glass.m, glass.eta
     cosine = -(d[0] * s_x + d[1] * s_y + d[2] * s_z)
     share, cos_t = fresnel_dielectric(min(cosine, 1.0), eta)
     # two ways on: what is behind is no longer one direction
@@ -92,18 +134,18 @@ def scatter_smooth_glass(
         paths.flags[p] &= ~FLAG_CAMERA_RAY
         along = cosine / eta - cos_t
         t_x, t_y, t_z = normalize(t_x / eta + along * s_x, t_y / eta + along * s_y, t_z / eta + along * s_z)
-    paths.medium_ids[p] = m if is_entering else -1
+    _enter_far_side(paths, p, glass)
     x, y, z = offset_ray_origin(x, y, z, -n_x, -n_y, -n_z)
     spawn_ray(paths, p, x, y, z, t_x, t_y, t_z, 0.0)
 
 
 @njit_no_refcount(forceinline=True)
 def _rough_glass_gain(glass: Glass, o_z: float) -> float:
-    """Return the factor that makes up for the light that one bounce loses."""
-    materials, m, is_entering = glass
-    if not materials.energy_compensation[m]:
+    """Return the factor that makes up for the light that one bounce loses; between two glasses it is lost."""
+    materials, m = glass.materials, glass.m
+    if not (materials.energy_compensation[m] and glass.is_in_air):
         return 1.0
-    table = materials.coat_tables[m] + (0 if is_entering else 1)
+    table = materials.coat_tables[m] + (0 if glass.is_entering else 1)
     # the directional albedo of one bounce, scaled up to 1
     return 1.0 / table_value(materials.coat_albedo[table], o_z, materials.roughness[m])
 
@@ -121,8 +163,7 @@ def scatter_rough_glass(
     (x, y, z), (n_x, n_y, n_z), (s_x, s_y, s_z) = point
     lights, shadows, k = query.lights, query.shadows, query.k
     d = paths.directions_world[p]
-    materials, m, is_entering = glass
-    eta = relative_ior(glass)
+    materials, m, eta = glass.materials, glass.m, glass.eta
     tint, roughness = materials.colors_linear[m], materials.roughness[m]
     alpha = roughness * roughness
     # --- the direction to the viewer, in the frame of the shading normal ---
@@ -152,6 +193,8 @@ def scatter_rough_glass(
             factor = gain * value / (l_pdf + pdf if lights.is_hittable[l] else l_pdf)
         if value > 0.0:
             through = i_z < 0.0
+            if through and is_nested(materials, m):
+                cross_surface(shadows.media[k], m, glass.is_entering)
             # nothing is in the way of what casts no shadows
             distance = distance if lights.casts_shadows[l] else 0.0
             radiance = (
@@ -180,6 +223,6 @@ def scatter_rough_glass(
     paths.flags[p] = (paths.flags[p] | FLAG_SCATTERED) & ~(FLAG_CLEAR | FLAG_CAMERA_RAY)
     w_x, w_y, w_z = normalize(w_x, w_y, w_z)
     if through:
-        paths.medium_ids[p] = m if is_entering else -1
+        _enter_far_side(paths, p, glass)
     x, y, z = back if through else front
     spawn_ray(paths, p, x, y, z, w_x, w_y, w_z, pdf)

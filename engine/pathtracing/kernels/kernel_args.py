@@ -45,6 +45,7 @@ class MaterialArrays(NamedTuple):
         absorption: per world unit.
         clear_coats: share of the surface under a clear coat.
         clear_coat_roughness: perceptual.
+        priorities: of glass in glass, -1 for none.
         substrates: how the ground shares light with the coat.
         energy_compensation: whether light that facets throw at each other is kept.
         coat_tables: which of the tables the coat has; of rough glass that of entering, leaving has the next.
@@ -72,6 +73,7 @@ class MaterialArrays(NamedTuple):
     absorption: Float64[np.ndarray, "m 3"]
     clear_coats: Float64[np.ndarray, " m"]
     clear_coat_roughness: Float64[np.ndarray, " m"]
+    priorities: Int32[np.ndarray, " m"]
     substrates: Int32[np.ndarray, " m"]
     energy_compensation: Int32[np.ndarray, " m"]
     coat_tables: Int32[np.ndarray, " m"]
@@ -174,12 +176,14 @@ class MeshScene(NamedTuple):
         materials: theirs.
         lights: all lights.
         environment: number of the light that is the environment, -1 without one.
+        any_nested: whether there is glass with a priority.
     """
 
     surfaces: SurfaceArrays
     materials: MaterialArrays
     lights: LightArrays
     environment: int
+    any_nested: bool
 
 
 class LayerArrays(NamedTuple):

@@ -14,6 +14,8 @@ CAMERA_SAMPLE_PAIRS = 2
 """Pairs of uniform numbers that a path uses at the camera: one for the pixel, one for the lens."""
 SAMPLE_PAIRS_PER_BOUNCE = 5
 """Pairs of uniform numbers that a path uses at each surface."""
+MAX_NESTED = 4
+"""Meshes of glass in each other of which a path keeps account."""
 PATH_ENDED = -2
 """In place of a face: the ray ended in front of what it would have met."""
 
@@ -41,6 +43,7 @@ class PathArrays(NamedTuple):
         t_view_origin: where on the next ray its viewer stands, see
             :class:`octasplat.engine.core.rays.RayBatch`.
         medium_ids: material that the path is in, -1 for air.
+        media: glass with a priority that it is inside, in the order of entering, -1 for none.
         flags: bits of :mod:`octasplat.engine.pathtracing.kernels.scatter`.
         is_alive: whether the path goes on.
     """
@@ -61,6 +64,7 @@ class PathArrays(NamedTuple):
     pdf: Float32[np.ndarray, " p"]
     t_view_origin: Float32[np.ndarray, " p"]
     medium_ids: Int32[np.ndarray, " p"]
+    media: Int32[np.ndarray, "p d"]
     flags: Int32[np.ndarray, " p"]
     is_alive: Bool[np.ndarray, " p"]
 
@@ -77,6 +81,7 @@ class ShadowRayArrays(NamedTuple):
             would have come.
         passes_glass: whether glass in the way lets light straight through, as no path could find it
             otherwise.
+        media: glass with a priority that the points are inside.
     """
 
     origins_world: Float32[np.ndarray, "n 3"]
@@ -85,6 +90,7 @@ class ShadowRayArrays(NamedTuple):
     radiance_linear: Float32[np.ndarray, "n 3"]
     occluded_radiance_linear: Float32[np.ndarray, "n 3"]
     passes_glass: Bool[np.ndarray, " n"]
+    media: Int32[np.ndarray, "n d"]
 
 
 class SurfaceInteractions(NamedTuple):
@@ -110,11 +116,13 @@ class MeshHits(NamedTuple):
         distances: infinite where a ray meets nothing.
         faces: -1 where a ray meets nothing.
         barycentrics: weights of the second and third corner.
+        media: glass with a priority that the rays are inside when they arrive; no rows where there is none.
     """
 
     distances: Float32[np.ndarray, " n"]
     faces: Int32[np.ndarray, " n"]
     barycentrics: Float32[np.ndarray, "n 2"]
+    media: Int32[np.ndarray, "m d"]
 
 
 class PathSamples(NamedTuple):
@@ -249,8 +257,14 @@ def allocate_paths(count: int) -> PathArrays:
         vectors(), vectors(), vectors(), vectors(), vectors(),
         np.empty(count, np.float32), vectors(), np.empty(count, np.float32), np.empty(count, np.float32),
         vectors(), vectors(), np.empty(count, np.float32), np.empty(count, np.float32),
-        np.empty(count, np.int32), np.empty(count, np.int32), np.empty(count, np.bool_),
+        np.empty(count, np.int32), allocate_media(count), np.empty(count, np.int32),
+        np.empty(count, np.bool_),
     )  # fmt: skip
+
+
+def allocate_media(count: int) -> Int32[np.ndarray, "n d"]:
+    """Return lists of glass with nothing in them."""
+    return np.full((count, MAX_NESTED), -1, np.int32)
 
 
 def allocate_shadow_rays(count: int) -> ShadowRayArrays:
@@ -258,6 +272,7 @@ def allocate_shadow_rays(count: int) -> ShadowRayArrays:
     return ShadowRayArrays(
         np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32), np.zeros(count, np.float32),
         np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32), np.zeros(count, np.bool_),
+        allocate_media(count),
     )  # fmt: skip
 
 

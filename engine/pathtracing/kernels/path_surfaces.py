@@ -12,12 +12,13 @@ from jaxtyping import Int32
 
 from octasplat.engine.core.compilation import kernel
 from octasplat.engine.pathtracing.kernels.glass import (
-    Glass,
+    glass_surface,
     scatter_mirror,
     scatter_rough_glass,
     scatter_smooth_glass,
 )
 from octasplat.engine.pathtracing.kernels.kernel_args import AlbedoTables, Bsdf, MeshScene, SurfacePoint, Vec3
+from octasplat.engine.pathtracing.kernels.nested_glass import copy_media
 from octasplat.engine.pathtracing.kernels.path_args import (
     BLOCK_SIZE,
     CAMERA_SAMPLE_PAIRS,
@@ -113,12 +114,12 @@ def _scatter_at_material(
     m = surfaces.material_ids[face]
     kind = materials.kinds[m]
     # --- glass ---
-    if kind == GLASS and materials.roughness[m] >= MIN_GLASS_ROUGHNESS and materials.iors[m] != 1.0:
-        scatter_rough_glass(paths, p, Glass(materials, m, is_front), point, samples, query)
-        return
     if kind == GLASS:
-        choice = sample_pair(samples, LOBE_SAMPLE)[0]
-        scatter_smooth_glass(paths, p, Glass(materials, m, is_front), point, choice)
+        glass = glass_surface(materials, m, is_front, paths.media[p])
+        if materials.roughness[m] >= MIN_GLASS_ROUGHNESS and glass.eta != 1.0:
+            scatter_rough_glass(paths, p, glass, point, samples, query)
+        else:
+            scatter_smooth_glass(paths, p, glass, point, sample_pair(samples, LOBE_SAMPLE)[0])
         return
     # --- the material's numbers, textures looked up ---
     uv = surfaces.corner_uv[face]
@@ -170,9 +171,12 @@ def shade_surfaces(first: int, last: int, scratch: PathScratch, bounce: Bounce) 
             n = -1
         p, face = active[k], hits.faces[k]
         shadows.radiance_linear[k, 0] = shadows.radiance_linear[k, 1] = shadows.radiance_linear[k, 2] = 0.0
-        # --- nothing was met ---
         if face == PATH_ENDED:
             continue
+        # what lies behind a passed surface of glass is found by this path alone: it shadows light queries
+        if scene.any_nested and copy_media(hits.media[k], paths.media[p]):
+            paths.pdf[p] = 0.0
+        # --- nothing was met ---
         if face < 0:
             shade_miss(paths, p, lights, scene.environment, integrator)
             paths.is_alive[p] = False
@@ -223,6 +227,8 @@ def shade_surfaces(first: int, last: int, scratch: PathScratch, bounce: Bounce) 
         ):
             continue
         query = LightQuery(lights, integrator, shadows, k)
+        if scene.any_nested:
+            copy_media(paths.media[p], shadows.media[k])
         _scatter_at_material(
             paths, p, scene, face, (a, b, c), facing >= 0.0,
             SurfacePoint(point, (n_x, n_y, n_z), (s_x, s_y, s_z)), is_guide, samples, query,

@@ -8,6 +8,13 @@ from jaxtyping import Float32, Int32
 from octasplat.engine.core.compilation import kernel
 from octasplat.engine.pathtracing.kernels.cutouts import MAX_CUTOUTS, eval_opacity, restart_distance
 from octasplat.engine.pathtracing.kernels.kernel_args import MaterialArrays, MeshQueries, SurfaceArrays
+from octasplat.engine.pathtracing.kernels.nested_glass import (
+    cross_surface,
+    index_of,
+    is_hidden,
+    is_nested,
+    medium_of,
+)
 from octasplat.engine.pathtracing.kernels.path_args import BLOCK_SIZE, PathScratch, ShadowRayArrays
 from octasplat.engine.pathtracing.kernels.principled_bsdf import fresnel_dielectric
 from octasplat.engine.pathtracing.kernels.rough_dielectric import MIN_GLASS_ROUGHNESS
@@ -73,13 +80,51 @@ def _trace_occlusion(
 
 
 @njit_no_refcount(forceinline=True)
-def _glass_share(materials: MaterialArrays, m: int, cosine: float, passes_rough_glass: bool) -> float:
+def _glass_share(roughness: float, eta: float, cosine: float, passes_rough_glass: bool) -> float:
     """Return the share of light that a surface of glass lets straight through."""
     # rough glass passes light on by paths from its own surface
-    if not passes_rough_glass and materials.roughness[m] >= MIN_GLASS_ROUGHNESS and materials.iors[m] != 1.0:
+    if not passes_rough_glass and roughness >= MIN_GLASS_ROUGHNESS and eta != 1.0:
         return 0.0
-    reflectance, _ = fresnel_dielectric(min(abs(cosine), 1.0), materials.iors[m])
+    reflectance, _ = fresnel_dielectric(min(abs(cosine), 1.0), eta)
     return 1.0 - reflectance
+
+
+@njit_no_refcount(forceinline=True)
+def _attenuate_by_medium(
+    materials: MaterialArrays, medium: int, length: float, k: int, transmittance: Float32[np.ndarray, "n 3"]
+) -> None:
+    """Attenuate row ``k`` by a length in a medium."""
+    if medium >= 0 and length < math.inf:
+        for channel in range(3):
+            transmittance[k, channel] *= math.exp(-materials.absorption[medium, channel] * length)
+
+
+@njit_no_refcount(forceinline=True)
+def _cross_nested_glass(
+    materials: MaterialArrays,
+    m: int,
+    cosine: float,
+    length: float,
+    passes_rough_glass: bool,
+    shadows: ShadowRayArrays,
+    k: int,
+    transmittance: Float32[np.ndarray, "n 3"],
+) -> None:
+    """Attenuate row ``k`` at a surface of glass with a priority, and by the ``length`` of the way there."""
+    media = shadows.media[k]
+    _attenuate_by_medium(materials, medium_of(materials, media), length, k, transmittance)
+    is_entering = cosine <= 0.0
+    hidden = is_hidden(materials, media, m, is_entering)
+    near = index_of(materials, medium_of(materials, media))
+    cross_surface(media, m, is_entering)
+    if hidden:
+        return
+    far = index_of(materials, medium_of(materials, media))
+    # either way as seen from the thinner side, as the direction is that in air
+    eta = max(near, far) / min(near, far)
+    share = _glass_share(materials.roughness[m], eta, cosine, passes_rough_glass)
+    for channel in range(3):
+        transmittance[k, channel] *= share * materials.colors_linear[m, channel]
 
 
 @njit_no_refcount(forceinline=True)
@@ -112,11 +157,15 @@ def _trace_filters(
         closest_hits(queries.closest_hit_filter, rays, 0, count, False, scratch.embree, met)
         left = 0
         for i in range(count):
-            # rays that meet no more of it leave the list with what they have
-            if scratch.faces[i] < 0:
-                continue
             place = scratch.rows[i]
             k = first + place
+            # rays that meet no more of it leave the list with what they have
+            if scratch.faces[i] < 0:
+                length = float(shadows.t_max[k] - scratch.t_starts[place])
+                _attenuate_by_medium(
+                    materials, medium_of(materials, shadows.media[k]), length, k, transmittance
+                )
+                continue
             face = queries.filter_faces[scratch.faces[i]]
             m = surfaces.material_ids[face]
             t = scratch.distances[i]
@@ -124,12 +173,20 @@ def _trace_filters(
                 n_x, n_y, n_z = face_normal(surfaces.corners_world[face])
                 d = shadows.directions_world[k]
                 cosine = n_x * d[0] + n_y * d[1] + n_z * d[2]
-                share = _glass_share(materials, m, cosine, passes_rough_glass)
-                # Out of the glass: what it absorbed on the way.
-                length = float(t - scratch.t_starts[place]) if cosine > 0.0 else 0.0
-                for channel in range(3):
-                    passed = math.exp(-materials.absorption[m, channel] * length)
-                    transmittance[k, channel] *= share * materials.colors_linear[m, channel] * passed
+                length = float(t - scratch.t_starts[place])
+                if is_nested(materials, m):
+                    _cross_nested_glass(
+                        materials, m, cosine, length, passes_rough_glass, shadows, k, transmittance
+                    )  # fmt: skip
+                else:
+                    share = _glass_share(
+                        materials.roughness[m], materials.iors[m], cosine, passes_rough_glass
+                    )
+                    # Out of the glass: what it absorbed on the way.
+                    length = length if cosine > 0.0 else 0.0
+                    for channel in range(3):
+                        passed = math.exp(-materials.absorption[m, channel] * length)
+                        transmittance[k, channel] *= share * materials.colors_linear[m, channel] * passed
             else:
                 b, c = float(scratch.barycentrics[i, 0]), float(scratch.barycentrics[i, 1])
                 u, v = interpolate_uv(surfaces.corner_uv[face], 1.0 - b - c, b, c)

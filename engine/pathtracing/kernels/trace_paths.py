@@ -5,7 +5,7 @@ from jaxtyping import Float32
 
 from octasplat.engine.core.compilation import kernel
 from octasplat.engine.pathtracing.kernels.camera_paths import start_paths
-from octasplat.engine.pathtracing.kernels.cutouts import pass_holes
+from octasplat.engine.pathtracing.kernels.cutouts import pass_surfaces
 from octasplat.engine.pathtracing.kernels.kernel_args import IntegratorParameters, MeshQueries, MeshScene
 from octasplat.engine.pathtracing.kernels.path_args import (
     BLOCK_SIZE,
@@ -53,8 +53,8 @@ def trace_paths(
             # neighbors have about one direction at the camera only
             closest_hits(queries.closest_hit, rays, 0, left, depth == 0, scratch.embree, met)
             bounce = Bounce(paths, active, depth, hits, scene, integrator, shadows)
-            if queries.any_cutout:
-                pass_holes(0, left, scratch, queries, bounce)
+            if queries.any_cutout or scene.any_nested:
+                pass_surfaces(0, left, scratch, queries, bounce)
             # --- surfaces, and light that reaches them ---
             shade_surfaces(0, left, scratch, bounce)
             shadow_transmittance(

@@ -84,11 +84,14 @@ class Glass(StageModel):
     """Clear or rough glass, for closed meshes.
 
     Attributes:
-        ior: index of refraction; that of the surroundings is 1.
+        ior: index of refraction; that of the surroundings is 1, or that of the glass around it where both
+            have a priority.
         tint_srgb: color that light takes at each surface that it passes.
         absorption: what is absorbed inside in each linear channel, per world unit (Beer's law).
         roughness: of its surface; perceptual, GGX's alpha is its square; below 0.03 it is smooth.
         multiple_scattering: light that facets throw at each other is kept, not lost.
+        priority: where meshes of glass overlap, the one with the highest is there, of equal ones the one that
+            a ray enters last. Without a priority it is taken to stand in air.
     """
 
     kind: Literal["glass"] = "glass"
@@ -97,6 +100,7 @@ class Glass(StageModel):
     absorption: tuple[NonNegative, NonNegative, NonNegative] = (0.0, 0.0, 0.0)
     roughness: UnitInterval = 0.0
     multiple_scattering: bool = True
+    priority: Annotated[int, Field(ge=0, le=1000)] | None = None
 
 
 class Metal(NormalMapped, ClearCoated):
