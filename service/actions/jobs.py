@@ -32,6 +32,7 @@ from octasplat.workers.db.rows import Job, JobState
 from octasplat.workers.queue import jobs as rows
 from octasplat.workers.queue.block_jobs import ROOT, blocks_of
 from octasplat.workers.queue.block_jobs import cancel_job as cancel_job_row
+from octasplat.workers.queue.fair_share import queue_position
 from octasplat.workers.queue.jobs import JobOrder
 from octasplat.workers.queue.usage_figures import running_by_queue
 from octasplat.workers.worker.job_kinds import get_job_kind
@@ -246,7 +247,7 @@ async def job_view(connection: Connection, service: Service, principal: Principa
     view = JobView.from_row(
         replace(with_block_progress(job, blocks), options=complete_options(job)),
         stages_of(job),
-        await rows.queue_position(connection, job),
+        await queue_position(connection, job),
         notes,
         shows_worker=principal.may("admin"),
     )

@@ -20,7 +20,7 @@ from octasplat.workers.client.short_ids import short_id
 from octasplat.workers.db.connections import Connection, select_columns
 from octasplat.workers.db.datasets import files_of, get_dataset
 from octasplat.workers.db.rows import Artifact, Dataset, DatasetFile, Job, JobEvent, JobState
-from octasplat.workers.queue import jobs as rows
+from octasplat.workers.queue.fair_share import queue_position
 from octasplat.workers.queue.jobs import JobOrder
 
 ACTIVE: tuple[JobState, ...] = ("queued", "running", "canceling")
@@ -170,7 +170,7 @@ async def _job_rows(service: Service, connection: Connection, jobs: Sequence[Job
     )
     lines = []
     for job in jobs:
-        view = JobView.from_row(job, stages_of(job), await rows.queue_position(connection, job))
+        view = JobView.from_row(job, stages_of(job), await queue_position(connection, job))
         measured = contents.get(job.id, {})
         gaussians = measured.get("gaussians")
         psnr = mean_psnr(measured)

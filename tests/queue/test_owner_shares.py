@@ -1,13 +1,14 @@
 """Owners share the workers first; priorities order the jobs of one owner."""
 
 from collections import Counter
+from collections.abc import Awaitable, Callable
 
 from octasplat.workers.db.connections import Pool, open_pool
 from octasplat.workers.db.quotas import Quota, set_quota
 from octasplat.workers.db.rows import Job
 from octasplat.workers.queue.claims import claim
-from octasplat.workers.queue.fair_share import choose_job
-from octasplat.workers.queue.jobs import NewJob, create_job, get_job, queue_position, requeue_job
+from octasplat.workers.queue.fair_share import choose_job, queue_position
+from octasplat.workers.queue.jobs import NewJob, create_job, get_job, requeue_job
 from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
 
 QUEUE = ProcrastinateQueue(stale_seconds=5)
@@ -88,9 +89,20 @@ async def test_delayed_jobs_do_not_hold_up_those_behind_them(conninfo: str) -> N
 
 async def test_choice_costs_what_owners_cost(conninfo: str) -> None:
     async with open_pool(conninfo, max_size=1) as pool:
-        jobs = await queue_jobs(pool, "alice", 1)
-        await queue_jobs(pool, "bob", 1)
-        before = await _rows_read(pool, jobs[0])
+        [first] = await queue_jobs(pool, "alice", 1)
+        [other] = await queue_jobs(pool, "bob", 1)
+
+        async def choose() -> None:
+            async with pool.connection() as connection:
+                job = await get_job(connection, first.id)
+            assert job is not None and job.slip is not None
+            await choose_job(pool, QUEUE, job.id, job.slip)
+
+        async def tell_position() -> None:
+            async with pool.connection() as connection:
+                assert await queue_position(connection, other) == 1
+
+        before = [await _rows_read(pool, action) for action in (choose, tell_position)]
         async with pool.connection() as connection:
             await connection.execute(
                 """
@@ -98,16 +110,17 @@ async def test_choice_costs_what_owners_cost(conninfo: str) -> None:
                 SELECT gen_random_uuid(), 'alice', 'toy', '{}', 'cpu', 0, n FROM generate_series(1000, 5000) n
                 """
             )
-        assert await _rows_read(pool, jobs[0]) < before + 20
+            await connection.execute("ANALYZE jobs")
+        assert await _rows_read(pool, choose) < before[0] + 20
+        assert await _rows_read(pool, tell_position) < before[1] + 20
 
 
-async def _rows_read(pool: Pool, job: Job) -> int:
-    """Return how many rows of the jobs a choice reads."""
+async def _rows_read(pool: Pool, action: Callable[[], Awaitable[None]]) -> int:
+    """Return how many rows of the jobs an action reads."""
     counts = []
-    for choose in (False, True):
-        if choose:
-            assert job.slip is not None
-            await choose_job(pool, QUEUE, job.id, job.slip)
+    for act in (False, True):
+        if act:
+            await action()
         async with pool.connection() as connection:
             await connection.execute("SELECT pg_stat_force_next_flush()")
         async with pool.connection() as connection:

@@ -11,6 +11,7 @@ from octasplat.workers.db.ids import new_id
 from octasplat.workers.queue.attempts import FencedError, ResultFile
 from octasplat.workers.queue.block_jobs import cancel_job
 from octasplat.workers.queue.claims import claim
+from octasplat.workers.queue.fair_share import queue_position
 from octasplat.workers.queue.job_endings import MAX_SILENT_RECOVERIES
 from octasplat.workers.queue.jobs import (
     NewJob,
@@ -19,7 +20,6 @@ from octasplat.workers.queue.jobs import (
     delete_job,
     get_job,
     list_jobs,
-    queue_position,
     retry_job,
 )
 from octasplat.workers.queue.protocol import JobQueue

@@ -7,7 +7,8 @@ from octasplat.workers.db.connections import Pool, open_pool
 from octasplat.workers.db.rows import Job
 from octasplat.workers.queue.block_jobs import cancel_job
 from octasplat.workers.queue.claims import claim
-from octasplat.workers.queue.jobs import NewJob, create_job, get_job, queue_position, retry_job
+from octasplat.workers.queue.fair_share import queue_position
+from octasplat.workers.queue.jobs import NewJob, create_job, get_job, retry_job
 from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue, requeued_entry_id
 from octasplat.workers.queue.recovery import StalledAttempts, recover_stalled_jobs
 

@@ -117,6 +117,8 @@ class Job:
         begun_anew: why an attempt did not go on from the checkpoint that there was.
         root_id: the job of which it does a part; such jobs are in no list, and no quota counts them.
         role: ``root`` of a job in blocks, ``block`` of its parts; None for any other.
+        place: in the queue, among the jobs of its owner: the entry with which it was queued, which it keeps
+            when it is interrupted; of a block that of the whole. None where the last version queued it.
     """
 
     id: uuid.UUID
@@ -162,11 +164,17 @@ class Job:
     view_notes: list[dict[str, Any]] = field(default_factory=list)
     root_id: uuid.UUID | None = None
     role: str | None = None
+    place: int | None = None
 
     @property
     def is_over(self) -> bool:
         """Return whether the job is in a terminal state."""
         return self.state in TERMINAL
+
+    @property
+    def place_in_queue(self) -> int | None:
+        """Return its place among the jobs of its owner; None if it was never queued or is over."""
+        return self.slip if self.place is None else self.place
 
     @property
     def waits_for_blocks(self) -> bool:

@@ -93,7 +93,7 @@ async def start_blocks(
                 """,
                 [child.id],
             )
-            await requeue_job(connection, job_queue, child)
+            await requeue_job(connection, job_queue, replace(child, place=root.place_in_queue))
         await connection.execute(
             "INSERT INTO job_needs (job_id, needs_id) VALUES (%s, %s) ON CONFLICT DO NOTHING",
             [root.id, child.id],
@@ -134,6 +134,9 @@ async def settle_root(connection: Connection, job_queue: JobQueue, root_id: uuid
 
     A block that failed ends the others and then the job; where the job is being canceled, so are its blocks.
     """
+    # As a rule there is nothing to do, for which not every block has to be locked.
+    if not await unsettled_roots(connection, root_id):
+        return
     async with connection.transaction():
         children = await _lock_blocks(connection, root_id)
         root = await get_job(connection, root_id, lock=True)
@@ -152,17 +155,18 @@ async def settle_root(connection: Connection, job_queue: JobQueue, root_id: uuid
             await end_job(connection, root, "canceled" if root.error is None else "failed", root.error)
 
 
-async def unsettled_roots(connection: Connection) -> list[uuid.UUID]:
-    """Return the jobs that wait for blocks and may have to go on, or to end."""
+async def unsettled_roots(connection: Connection, root_id: uuid.UUID | None = None) -> list[uuid.UUID]:
+    """Return the jobs that wait for blocks and may have to go on, or to end; of all, or of the one given."""
     cursor = await connection.execute(
         """
         SELECT id FROM jobs AS root
-        WHERE state IN ('running', 'canceling') AND heartbeat_at IS NULL AND role = %s AND (
+        WHERE state IN ('running', 'canceling') AND heartbeat_at IS NULL AND role = %(role)s
+          AND (%(id)s::uuid IS NULL OR id = %(id)s) AND (
             state = 'canceling' OR NOT EXISTS (SELECT FROM job_needs WHERE job_id = root.id)
             OR EXISTS (SELECT FROM jobs WHERE root_id = root.id AND state IN ('failed', 'canceled')))
         ORDER BY id
         """,
-        [ROOT],
+        {"role": ROOT, "id": root_id},
     )
     return [row["id"] for row in await cursor.fetchall()]
 
@@ -291,4 +295,5 @@ def _job_of_block(root: Job, kind: str, block: NewBlock) -> NewJob:
         estimate=root.estimate,
         root_id=root.id,
         role=BLOCK,
+        place=root.place_in_queue,
     )

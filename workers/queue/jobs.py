@@ -78,6 +78,7 @@ class NewJob:
     requested: Mapping[str, Any] | None = None
     root_id: uuid.UUID | None = None
     role: str | None = None
+    place: int | None = None
 
 
 @dataclass(frozen=True)
@@ -105,14 +106,14 @@ async def create_job(connection: Connection, job_queue: JobQueue, new: NewJob) -
         await connection.execute(
             """
             INSERT INTO jobs (id, owner, kind, dataset_id, source_id, label, options, queue, priority, slip,
-                              traceparent, estimate, files_id, requested, root_id, role)
-            VALUES (%s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s)
+                              traceparent, estimate, files_id, requested, root_id, role, place)
+            VALUES (%s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s)
             """,
             [
                 job_id, new.owner, new.kind, new.dataset_id, new.source_id, new.label,
                 as_json(dict(new.options)), new.queue, new.priority, entry_id, new.traceparent,
                 as_json_or_null(new.estimate), new.files_id, as_json_or_null(new.requested),
-                new.root_id, new.role,
+                new.root_id, new.role, entry_id if new.place is None else new.place,
             ],
         )  # fmt: skip
         # What a new job uses is not about to expire any more.
@@ -175,33 +176,6 @@ async def list_jobs(
             "limit": limit,
         },
     )
-
-
-async def queue_position(connection: Connection, job: Job) -> int | None:
-    """Return how many jobs go before a queued job in its queue, if owners take turns; None for any other."""
-    if job.state != "queued":
-        return None
-    # Owners take turns: of each other one as many go before as of this one, one more if it waits longer.
-    cursor = await connection.execute(
-        """
-        WITH waiting AS (
-            SELECT owner, priority, slip FROM jobs WHERE state = 'queued' AND queue = %(queue)s
-        ), own AS (
-            SELECT count(*) AS n FROM waiting
-            WHERE owner = %(owner)s
-              AND (priority > %(priority)s OR priority = %(priority)s AND slip < %(slip)s)
-        )
-        SELECT own.n + (
-            SELECT coalesce(sum(least(n, own.n + CASE WHEN first < %(slip)s THEN 1 ELSE 0 END)), 0) FROM (
-                SELECT count(*) AS n, min(slip) AS first FROM waiting
-                WHERE owner <> %(owner)s GROUP BY owner
-            ) AS others
-        ) AS ahead FROM own
-        """,
-        {"queue": job.queue, "owner": job.owner, "priority": job.priority, "slip": job.slip},
-    )
-    row = await cursor.fetchone()
-    return int(row["ahead"]) if row else 0
 
 
 async def retry_job(
@@ -307,12 +281,13 @@ async def requeue_job(
     entry_id = await job_queue.enqueue(connection, entry)
     await connection.execute(
         """
-        UPDATE jobs SET slip = %(entry)s, waits_for = %(reason)s, delayed_until =
+        UPDATE jobs SET slip = %(entry)s, place = %(place)s, waits_for = %(reason)s, delayed_until =
             CASE WHEN %(delay)s > 0 THEN now() + make_interval(secs => %(delay)s) END
         WHERE id = %(job)s
         """,
         {
             "entry": entry_id,
+            "place": entry_id if job.slip is None and job.root_id is None else job.place_in_queue,
             "reason": None if reason is None else storable_text(reason),
             "delay": delay_seconds,
             "job": job.id,
