@@ -77,3 +77,4 @@ job_seconds
 stage_seconds
 total_seconds_left
 resolved_by
+map_position

@@ -1,4 +1,4 @@
-"""The queue's part of jobs in blocks: thousands of them without work, workers that are killed, and what is left.
+"""Jobs in blocks without work: thousands of them, workers that are killed, and whether anything is lost.
 
     python -m benchmarks.queue_simulation --roots 20 --blocks 500 --workers 20 --kills 60
 
@@ -340,7 +340,9 @@ def main() -> None:
         try:
             asyncio.run(queue_roots(conninfo, arguments.roots, arguments.blocks, arguments.owners))
             (folder / "store").mkdir()
-            simulation = Simulation(conninfo, server.home, folder / "store", arguments.workers, arguments.seed)
+            simulation = Simulation(
+                conninfo, server.home, folder / "store", arguments.workers, arguments.seed
+            )
             found = report(simulation, simulation.run(arguments.kills, arguments.seconds_between))
         finally:
             server.stop()

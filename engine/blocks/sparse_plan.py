@@ -1,18 +1,15 @@
 """Blocks planned from the sparse points alone, in seconds and before anything is trained."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 
 from octasplat.engine.blocks.block_plan import MARGIN
 from octasplat.engine.blocks.partition import Box, cut_into_boxes, weighted_spread
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.dataset.model import DatasetModel
 from octasplat.engine.dataset.view_tiles import ViewTiles
-
-MAP_SIDE_PX, MAP_BORDER_PX = 800, 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,47 +89,3 @@ def _pixels_of_view(
     shares = np.bincount(place[member], minlength=down * across) / np.maximum(counts, 1)
     pixels_per_tile = view.width_px * view.height_px / max(int(np.count_nonzero(counts)), 1)
     return pixels_per_tile * int(np.count_nonzero(shares)), pixels_per_tile * float(shares.sum())
-
-
-def draw_map(model: DatasetModel, cores: Sequence[Box]) -> Float32[np.ndarray, "h w 3"]:
-    """Return a picture of the points along the axis of least spread, a color a block, cameras black.
-
-    Args:
-        model: views and points.
-        cores: boxes of the blocks.
-    """
-    points = model.points.xyz_world.astype(np.float64)
-    weights = np.maximum(model.points.track_lengths, 1).astype(np.float64)
-    cameras = np.stack([view.origin_world for view in model.views])
-    spread = weighted_spread(points, weights)
-    axes = np.sort(np.argsort(spread, kind="stable")[1:])
-    # most of the points and most of the cameras, whichever reach farther
-    ranges = [np.quantile(places[:, axes], [0.02, 0.98], axis=0) for places in (cameras, points)]
-    low, high = np.minimum(ranges[0][0], ranges[1][0]), np.maximum(ranges[0][1], ranges[1][1])
-    scale = (MAP_SIDE_PX - 2 * MAP_BORDER_PX) / max(float((high - low).max()), 1e-12)
-    size = np.ceil((high - low) * scale).astype(np.int64) + 2 * MAP_BORDER_PX
-    image = np.ones((size[1], size[0], 3), np.float32)
-    for number, core in enumerate(cores):
-        _draw_dots(image, (points[core.contains(points)][:, axes] - low) * scale, _color(number), 1)
-    _draw_dots(image, (cameras[:, axes] - low) * scale, np.zeros(3), 2)
-    return image
-
-
-def _draw_dots(
-    image: Float32[np.ndarray, "h w 3"], xy: Float64[np.ndarray, "n 2"], color: np.ndarray, radius: int
-) -> None:
-    """Draw squares of ``2 radius - 1`` pixels a side, those outside of the picture left out."""
-    height, width = image.shape[:2]
-    column, row = np.rint(xy + MAP_BORDER_PX).astype(np.int64).T
-    for down in range(1 - radius, radius):
-        for right in range(1 - radius, radius):
-            y, x = row + down, column + right
-            inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
-            image[y[inside], x[inside]] = color
-
-
-def _color(number: int) -> Float64[np.ndarray, "3"]:
-    """Return a color that differs from those of the numbers before: hues at steps of the golden section."""
-    hue = number * 0.618034 % 1.0
-    wave = np.abs((hue * 6 + np.array([0.0, 4.0, 2.0])) % 6 - 3) - 1
-    return 0.15 + 0.75 * np.clip(wave, 0, 1)

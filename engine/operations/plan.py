@@ -113,7 +113,8 @@ def run(
         ConfigError: a setting cannot be used, there is no model, or no blocks can be made.
         OutputError: the picture cannot be written.
     """
-    from octasplat.engine.blocks.sparse_plan import draw_map, plan_from_points
+    from octasplat.engine.blocks.block_map import draw_block_map
+    from octasplat.engine.blocks.sparse_plan import plan_from_points
     from octasplat.engine.dataset import load_dataset_model
     from octasplat.engine.dataset.model_sources import has_model
     from octasplat.engine.dataset.scene_split import SplitRule, split_scene
@@ -140,7 +141,7 @@ def run(
     blocks = plan_from_points(model, trained, count)
     files: tuple[Path, ...] = ()
     if request.picture is not None:
-        write_png(request.picture, draw_map(model, [block.core for block in blocks]))
+        write_png(request.picture, draw_block_map(model, [block.core for block in blocks]).image_srgb)
         files = (request.picture,)
     cores = request.cores or threads or available_threads()
     costs = _costs(model, blocks, config, asked.most_gaussians, cores)

@@ -13,7 +13,7 @@ from octasplat.service.auth import Principal, is_still_valid
 from octasplat.service.problems import ProblemError
 from octasplat.service.state import Service
 from octasplat.workers.db.events_and_logs import list_job_events, list_log_lines
-from octasplat.workers.db.rows import JobEvent, LogLine
+from octasplat.workers.db.rows import Job, JobEvent, LogLine
 from octasplat.workers.queue.jobs import get_job
 
 _POLL_SECONDS = 2.0
@@ -31,9 +31,10 @@ async def read_log(
     Raises:
         ProblemError: 404 if it does not exist or the principal may not see it.
     """
-    await read_job(service, principal, job_id)
+    job = await read_job(service, principal, job_id)
     async with service.pool.connection() as connection:
-        return await list_log_lines(connection, job_id, after, limit)
+        lines = await list_log_lines(connection, job_id, after, limit)
+    return [replace(line, attempt=job.count_starts(line.attempt)) for line in lines]
 
 
 async def read_events(
@@ -44,10 +45,10 @@ async def read_events(
     Raises:
         ProblemError: 404 if it does not exist or the principal may not see it.
     """
-    await read_job(service, principal, job_id)
+    job = await read_job(service, principal, job_id)
     async with service.pool.connection() as connection:
         events = await list_job_events(connection, job_id, after, limit)
-    return [_visible_event(principal, event) for event in events]
+    return [_visible_event(principal, job, event) for event in events]
 
 
 async def follow_events(
@@ -107,7 +108,7 @@ async def _stream_events(
                 continue
             for event in events:
                 after = event.number
-                yield _visible_event(principal, event)
+                yield _visible_event(principal, job, event)
             if len(events) == _PAGE_SIZE:
                 continue
             if over:
@@ -123,8 +124,9 @@ async def _stream_events(
                 continue
 
 
-def _visible_event(principal: Principal, event: JobEvent) -> JobEvent:
+def _visible_event(principal: Principal, job: Job, event: JobEvent) -> JobEvent:
     """Return an event as the principal sees it: the worker, named after its host, is for administrators."""
+    event = replace(event, attempt=job.count_starts(event.attempt))
     if principal.may("admin") or "worker" not in event.data:
         return event
     return replace(event, data={name: value for name, value in event.data.items() if name != "worker"})

@@ -251,7 +251,7 @@ async def job_view(connection: Connection, service: Service, principal: Principa
         notes,
         shows_worker=principal.may("admin"),
     )
-    return view.model_copy(update={"blocks": [BlockView.from_row(block) for block in blocks]})
+    return view.model_copy(update={"blocks": [BlockView.from_row(block, job) for block in blocks]})
 
 
 def _searchable_text(text: str | None) -> str | None:

@@ -138,7 +138,7 @@ class JobSummary(BaseModel):
     queue: str
     priority: int
     state: JobState
-    attempt: int = Field(description="Counts starts.")
+    attempt: int = Field(description="Counts starts; merging blocks belongs to the start that planned them.")
     rescues: int = Field(description="How often its worker was lost without a new checkpoint.")
     stage: str | None
     stages: list[str]
@@ -162,11 +162,15 @@ class JobSummary(BaseModel):
     )
     error: JobError | None
     checkpoint: CheckpointView | None
-    preview: dict[str, Any] | None = Field(description="`step` and `view` of GET /v1/jobs/{id}/preview.")
+    preview: dict[str, Any] | None = Field(
+        description="`step` and `view` of GET /v1/jobs/{id}/preview; no view: a map of its blocks."
+    )
     pinned: bool
     created_at: datetime
     queued_at: datetime
-    started_at: datetime | None
+    started_at: datetime | None = Field(
+        description="When the present attempt began; of a job in blocks the one that planned them."
+    )
     finished_at: datetime | None
     expires_at: datetime | None
 
@@ -186,6 +190,10 @@ class JobSummary(BaseModel):
         names = {name for name in cls.model_fields if name not in made}
         row = row if shows_worker else replace(row, worker=None)
         values = {name: getattr(row, name) for name in names}
+        values["attempt"] = row.count_starts(row.attempt)
+        values["started_at"] = row.begun_at or row.started_at
+        if row.preview is not None:
+            values["preview"] = {name: row.preview.get(name) for name in ("sha256", "step", "view")}
         return cls(
             **values,
             stages=stages,
@@ -208,13 +216,28 @@ class BlockView(BaseModel):
     total_steps: int | None
     seconds_left: float | None
     error: JobError | None
+    map_position: tuple[float, float] | None = Field(
+        None,
+        description="Its middle on the preview, a map while blocks are trained: 0 to 1 from left and top.",
+    )
 
     @classmethod
-    def from_row(cls, row: Job) -> Self:
-        """Return the view of the row of a block's job."""
+    def from_row(cls, row: Job, root: Job) -> Self:
+        """Return the view of the row of a block's job.
+
+        Args:
+            row: of the block.
+            root: the whole.
+        """
         number = int(row.options["number"])
         names = ("id", "state", "attempt", "step", "total_steps", "seconds_left", "error")
-        return cls(number=number, name=f"block {number}", **{name: getattr(row, name) for name in names})
+        position = ((root.preview or {}).get("block_positions") or {}).get(str(number))
+        return cls(
+            number=number,
+            name=f"block {number}",
+            map_position=position,
+            **{name: getattr(row, name) for name in names},
+        )
 
 
 class JobView(JobSummary):

@@ -20,6 +20,7 @@ from octasplat.workers.client.short_ids import short_id
 from octasplat.workers.db.connections import Connection, select_columns
 from octasplat.workers.db.datasets import files_of, get_dataset
 from octasplat.workers.db.rows import Artifact, Dataset, DatasetFile, Job, JobEvent, JobState
+from octasplat.workers.queue.block_jobs import ROOT
 from octasplat.workers.queue.fair_share import queue_position
 from octasplat.workers.queue.jobs import JobOrder
 
@@ -31,6 +32,7 @@ STATE_FILTERS: dict[str, tuple[JobState, ...]] = {
     "failed": ("failed", "canceled"),
 }
 _MAX_EVENTS = 400
+_STAGE_KINDS = ("stage_started", "stage_finished")
 
 
 @dataclass(frozen=True)
@@ -133,8 +135,12 @@ async def job_detail(service: Service, principal: Principal, job_id: uuid.UUID) 
             # The newest so many, shown from the oldest on.
             events = (await cursor.fetchall())[::-1]
     # After a start from nothing, or by another worker, stages are gone through again.
-    current = [event for event in events if event.attempt == job.attempt]
+    current = [event for event in events if job.count_starts(event.attempt) == line.job.attempt]
     spent = {str(e.data.get("stage")): e.data.get("seconds") for e in current if e.kind == "stage_finished"}
+    # The training of all blocks begins in one attempt and ends in another.
+    if job.role == ROOT and "train" in spent:
+        times = [e.at for e in current if e.kind in _STAGE_KINDS and e.data.get("stage") == "train"]
+        spent["train"] = (max(times) - min(times)).total_seconds()
     warnings = [str(e.data.get("message")) for e in events if e.kind == "warning"]
     if dataset is not None:
         warnings = [*dataset.facts.get("warnings", ()), *warnings]

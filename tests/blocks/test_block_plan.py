@@ -9,7 +9,8 @@ import pytest
 from click.testing import CliRunner
 
 from octasplat.__main__ import cli
-from octasplat.engine.blocks.sparse_plan import draw_map, plan_from_points
+from octasplat.engine.blocks.block_map import SIDE_PX, draw_block_map
+from octasplat.engine.blocks.sparse_plan import plan_from_points
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.dataset import load_dataset_model
 from octasplat.engine.dataset.image_sizes import ImageSizes
@@ -52,7 +53,19 @@ def test_shares_of_blocks_add_up_to_the_whole_and_their_margins(scene: Path) -> 
     model = load_dataset_model(scene)
     blocks = plan_from_points(model, np.arange(12), 4)
     assert 1 <= sum(block.share for block in blocks) < 2
-    assert draw_map(model, [block.core for block in blocks]).shape[2] == 3
+
+
+def test_map_has_a_color_at_the_middle_of_each_block(scene: Path) -> None:
+    model = load_dataset_model(scene)
+    blocks = plan_from_points(model, np.arange(12), 4)
+    drawn = draw_block_map(model, [block.core for block in blocks])
+    assert drawn.image_srgb.shape == (SIDE_PX, SIDE_PX, 3) and drawn.middles.shape == (4, 2)
+    colors = []
+    for column, row in np.round(drawn.middles * SIDE_PX).astype(int):
+        near = drawn.image_srgb[row - 60 : row + 61, column - 60 : column + 61].reshape(-1, 3)
+        found, counts = np.unique(near[near.min(axis=1) < 0.9], axis=0, return_counts=True)
+        colors.append(tuple(found[counts.argmax()]))
+    assert len(set(colors)) == 4
 
 
 def test_number_of_blocks_grows_with_photographs_and_with_gaussians_that_do_not_fit() -> None:

@@ -1,5 +1,6 @@
 """A job in blocks over HTTP: its blocks in its own view, and no trace of them elsewhere."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import httpx
@@ -12,8 +13,16 @@ from octasplat.workers.queue.storage_leases import storage_lease
 from tests.support.service_harness import ConnectService, claim_job, committed_dataset, new_job, store_content
 
 
-async def job_in_blocks(http: httpx.AsyncClient, service: Service, **body: Any) -> dict[str, Any]:
-    """A job that waits for two blocks of 20 and 10 iterations, after 5 and with 5 more to come."""
+async def job_in_blocks(
+    http: httpx.AsyncClient,
+    service: Service,
+    places: Mapping[str, tuple[float, float]] | None = None,
+    **body: Any,
+) -> dict[str, Any]:
+    """A job that waits for two blocks of 20 and 10 iterations, after 5 and with 5 more to come.
+
+    With ``places`` there is a map of them.
+    """
     job = await new_job(http, service, **body)
     digest = store_content(service, b"plan")
     files = [{"path": "run/blocks/plan.npz", "sha256": digest, "size_bytes": 4}]
@@ -26,6 +35,9 @@ async def job_in_blocks(http: httpx.AsyncClient, service: Service, **body: Any) 
     ]
     attempt = await claim_job(service, job)
     async with storage_lease(service.pool, service.storage) as lease:
+        if places is not None:
+            row = {"sha256": store_content(service, b"map"), "step": 5, "view": None}
+            await attempt.record_preview(row, lease, block_positions=places)
         await attempt.start_blocks(
             service.job_queue, checkpoint, "toy", blocks, lease, first_steps=5, total_steps=40
         )
@@ -85,6 +97,62 @@ async def test_progress_and_time_left_are_of_all_blocks(connect_service: Connect
         told = {event["kind"]: event["data"] for event in timeline}
         assert told["blocks_queued"] == {"blocks": 2, "done": 0}
         assert told["block_finished"] == {"block": 1, "left": 1}
+
+
+async def test_job_is_one_start_and_its_time_is_that_of_the_whole(connect_service: ConnectService) -> None:
+    async with connect_service(webhook_hosts=("hooks.example",)) as (http, service):
+        hook = {"url": "https://hooks.example/a", "events": ["job.succeeded"]}
+        assert (await http.post("/v1/webhooks", json=hook)).status_code == 201
+        job = await job_in_blocks(http, service)
+        planned = await read(http, job)
+        for block in planned["blocks"]:
+            await (await claim_job(service, block)).succeed([], job_queue=service.job_queue)
+        assert (await read(http, job))["attempt"] == 1  # queued to be merged
+        merge = await claim_job(service, job)
+        view = await read(http, job)
+        assert (view["attempt"], view["started_at"]) == (1, planned["started_at"])
+        await merge.requeue(service.job_queue, "its worker is stopping")
+        merge = await claim_job(service, job)
+        assert (await read(http, job))["attempt"] == 2  # that start was interrupted
+        await merge.succeed([], job_queue=service.job_queue)
+        view = await read(http, job)
+        assert (view["state"], view["attempt"], view["started_at"]) == ("succeeded", 2, planned["started_at"])
+        log = (await http.get(f"/v1/jobs/{job['id']}/logs")).json()["lines"]
+        assert [(line["attempt"], line["text"]) for line in log if "Handed" not in line["text"]] == [
+            (1, "Attempt 1"),
+            (1, "Its blocks are trained"),
+            (2, "Attempt 2"),
+            (2, "Succeeded"),
+        ]
+        timeline = (await http.get(f"/v1/jobs/{job['id']}/timeline")).json()["events"]
+        assert [event["attempt"] for event in timeline if event["data"].get("state") == "running"] == [
+            1,
+            1,
+            2,
+        ]
+        assert " · attempt 2" in (await http.get(f"/jobs/{job['id']}")).text
+        async with service.pool.connection() as connection:
+            cursor = await connection.execute(
+                "SELECT payload->'data'->'attempt' AS n FROM webhook_deliveries"
+            )
+            assert [row["n"] for row in await cursor.fetchall()] == [2]
+
+
+async def test_blocks_are_on_a_map_with_their_states(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
+        places = {"1": (0.25, 0.5), "2": (0.75, 0.125)}
+        job = await job_in_blocks(http, service, places)
+        view = await read(http, job)
+        assert [block["map_position"] for block in view["blocks"]] == [[0.25, 0.5], [0.75, 0.125]]
+        assert set(view["preview"]) == {"sha256", "step", "view"} and view["preview"]["view"] is None
+        attempt = await claim_job(service, view["blocks"][0])
+        await attempt.set_progress(stage="train", step=5, total_steps=20, seconds_left=30.0)
+        page = (await http.get(f"/parts/jobs/{job['id']}")).text
+        assert "<title>block 1: running, 25 %</title>" in page and 'class="queued"' in page
+        assert "translate(75.0 12.5)" in page and f'href="/v1/jobs/{job["id"]}/preview?step=5"' in page
+        assert (await http.get(f"/v1/jobs/{job['id']}/preview")).content == b"map"
+        whole = (await http.get(f"/jobs/{job['id']}")).text
+        assert "None at step" not in whole
 
 
 async def test_cancelling_ends_all_blocks_and_deleting_takes_them_along(

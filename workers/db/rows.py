@@ -98,7 +98,8 @@ class Job:
         worker: name of the worker that has it.
         error: why it failed: ``type``, ``message``.
         checkpoint: manifest of the newest one that is stored.
-        preview: newest preview picture: ``sha256``, ``step`` and ``view``, the photograph it answers to.
+        preview: newest preview picture: ``sha256``, ``step`` and ``view``, the photograph it answers to; of a
+            map of blocks no view, and their ``block_positions``.
         estimate: what it was reckoned to take when it was accepted, see
             :class:`octasplat.engine.operations.cost_model.Estimate`.
         files_id: dataset of the files that its options name.
@@ -119,6 +120,8 @@ class Job:
         role: ``root`` of a job in blocks, ``block`` of its parts; None for any other.
         place: in the queue, among the jobs of its owner: the entry with which it was queued, which it keeps
             when it is interrupted; of a block that of the whole. None where the last version queued it.
+        continuations: attempts of a job in blocks that went on with what these had made.
+        begun_at: when the attempt of a job in blocks began that planned them; None for any other.
     """
 
     id: uuid.UUID
@@ -165,11 +168,22 @@ class Job:
     root_id: uuid.UUID | None = None
     role: str | None = None
     place: int | None = None
+    continuations: list[int] = field(default_factory=list)
+    begun_at: datetime | None = None
 
     @property
     def is_over(self) -> bool:
         """Return whether the job is in a terminal state."""
         return self.state in TERMINAL
+
+    def count_starts(self, attempt: int) -> int:
+        """Return how many starts there were up to an attempt; to go on after one's blocks is no further one.
+
+        >>> from types import SimpleNamespace
+        >>> Job.count_starts(SimpleNamespace(continuations=[2]), 3)
+        2
+        """
+        return attempt - sum(continued <= attempt for continued in self.continuations)
 
     @property
     def place_in_queue(self) -> int | None:

@@ -138,12 +138,14 @@ class Attempt:
             event = {key: manifest[key] for key in ("stage", "step") if key in manifest}
             await add_event(connection, job.id, job.attempt, "checkpoint", event)
 
-    async def record_preview(self, preview: Mapping[str, Any], lease: StorageLease | None = None) -> None:
-        """Record the newest preview picture: ``sha256``, ``step`` and ``view``; ``lease`` as above."""
+    async def record_preview(
+        self, preview: Mapping[str, Any], lease: StorageLease | None = None,
+        *, block_positions: Mapping[str, tuple[float, float]] | None = None,
+    ) -> None:  # fmt: skip
+        """Record the newest preview picture, ``lease`` as above; of a map with the places of blocks on it."""
+        row = {**preview, "block_positions": dict(block_positions)} if block_positions else dict(preview)
         async with self._fenced_transaction(lease, [preview["sha256"]]) as (connection, job):
-            await connection.execute(
-                "UPDATE jobs SET preview = %s WHERE id = %s", [as_json(dict(preview)), job.id]
-            )
+            await connection.execute("UPDATE jobs SET preview = %s WHERE id = %s", [as_json(row), job.id])
             await add_event(connection, job.id, job.attempt, "preview", preview)
 
     async def record_live_scene(self, scene: LiveScene, lease: StorageLease | None = None) -> None:

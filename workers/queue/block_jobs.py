@@ -101,7 +101,7 @@ async def start_blocks(
     await connection.execute(
         """
         UPDATE jobs SET role = %s, heartbeat_at = NULL, worker = NULL, seconds_left = NULL, rescues = 0,
-            stage = 'train', step = %s, total_steps = %s
+            begun_at = coalesce(begun_at, started_at), stage = 'train', step = %s, total_steps = %s
         WHERE id = %s
         """,
         [ROOT, first_steps, total_steps, root.id],
@@ -126,7 +126,7 @@ async def release_needs(connection: Connection, job_queue: JobQueue | None, chil
         data = {"block": int(child.options["number"]), "left": left}
         await add_event(connection, root.id, root.attempt, "block_finished", data)
         if job_queue is not None and root.state == "running" and not left:
-            await requeue_job(connection, job_queue, root)
+            await _continue_root(connection, job_queue, root)
 
 
 async def settle_root(connection: Connection, job_queue: JobQueue, root_id: uuid.UUID) -> None:
@@ -147,7 +147,7 @@ async def settle_root(connection: Connection, job_queue: JobQueue, root_id: uuid
             root = await _give_up(connection, root, ended, len(children))
         if root.state == "running":
             if not await _count_needs(connection, root.id):
-                await requeue_job(connection, job_queue, root)
+                await _continue_root(connection, job_queue, root)
             return
         for child in children:
             await _cancel(connection, job_queue, child)
@@ -267,6 +267,14 @@ async def _give_up(connection: Connection, root: Job, ended: Sequence[Job], coun
     )
     await add_event(connection, root.id, root.attempt, "state", {"state": "canceling"})
     return replace(root, state="canceling", error=error)
+
+
+async def _continue_root(connection: Connection, job_queue: JobQueue, root: Job) -> None:
+    """Queue a job whose blocks are done; its next attempt is a part of the same start."""
+    await connection.execute(
+        "UPDATE jobs SET continuations = continuations || %s WHERE id = %s", [[root.attempt + 1], root.id]
+    )
+    await requeue_job(connection, job_queue, root)
 
 
 async def _lock_blocks(connection: Connection, root_id: uuid.UUID) -> list[Job]:

@@ -36,7 +36,11 @@ async def claim(pool: Pool, job_id: uuid.UUID, entry_id: int, worker: str) -> At
         # ``job`` is the row as it was before the update.
         await add_event(connection, job_id, job.attempt + 1, "state", {"state": "running", "worker": worker})
         await trim_log(connection, job_id, MAX_EARLIER_LOG_LINES)
-        await add_log_lines(connection, job_id, job.attempt + 1, [f"Attempt {job.attempt + 1}"])
+        number = job.attempt + 1
+        line = (
+            "Its blocks are trained" if number in job.continuations else f"Attempt {job.count_starts(number)}"
+        )
+        await add_log_lines(connection, job_id, number, [line])
         claimed = await get_job(connection, job_id)
     assert claimed is not None
     return Attempt(pool, claimed)

@@ -43,7 +43,8 @@ _KEYS: LiteralString = """
         ELSE '' END,
     CASE %(order)s
         WHEN 'psnr' THEN -coalesce(psnr, -1)::float8
-        WHEN 'longest' THEN -coalesce(extract(epoch FROM finished_at - started_at), -1)::float8
+        WHEN 'longest' THEN
+            -coalesce(extract(epoch FROM finished_at - coalesce(begun_at, started_at)), -1)::float8
         ELSE 0 END,
     id
     """
@@ -209,7 +210,7 @@ async def retry_job(
         await connection.execute(
             """
             UPDATE jobs SET rescues = 0, error = NULL, stage = NULL, step = NULL, total_steps = NULL,
-                seconds_left = NULL, finished_at = NULL, worker = NULL, expires_at = NULL,
+                seconds_left = NULL, finished_at = NULL, worker = NULL, expires_at = NULL, begun_at = NULL,
                 checkpoint = CASE WHEN %(fresh)s THEN NULL ELSE checkpoint END,
                 begun_anew = CASE WHEN %(fresh)s THEN NULL ELSE begun_anew END,
                 psnr = CASE WHEN %(fresh)s THEN NULL ELSE psnr END,

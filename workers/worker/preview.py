@@ -32,12 +32,17 @@ MAX_TIME_FRACTION = 0.02
 
 @dataclass(frozen=True)
 class PreviewWritten(Event):
-    """A picture of view ``view`` after iteration ``step`` is at ``path``."""
+    """A picture of view ``view`` after iteration ``step`` is at ``path``.
+
+    Without a view it is a map of blocks: ``block_positions`` has the number of each, and where it is on the
+    picture, 0 to 1 from the left and the top.
+    """
 
     kind: ClassVar[str] = "preview_written"
     path: str
     step: int
-    view: str
+    view: str | None
+    block_positions: tuple[tuple[int, float, float], ...] = ()
 
 
 class PreviewRenderer:

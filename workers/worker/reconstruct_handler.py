@@ -2,12 +2,13 @@
 
 import shutil
 
-from octasplat.engine.blocks.scene_plan import block_name
+from octasplat.engine.blocks.block_map import draw_block_map
+from octasplat.engine.blocks.scene_plan import ScenePlan, block_name
 from octasplat.engine.core.compiling import report_compilation
-from octasplat.engine.core.errors import CheckpointError, ConfigError
+from octasplat.engine.core.errors import CheckpointError, ConfigError, OctasplatError
 from octasplat.engine.core.events import Event, PhaseFinished, PhaseProgress, Warned, broadcast
 from octasplat.engine.core.progress import stop_when_asked
-from octasplat.engine.dataset import Dataset
+from octasplat.engine.dataset import Dataset, load_dataset_model
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.operations.block_options import block_request
 from octasplat.engine.operations.photograph_sizes import photograph_sizes
@@ -20,12 +21,13 @@ from octasplat.engine.pipeline import (
     planned_blocks,
 )
 from octasplat.engine.pipeline import reconstruct as reconstruct_scene
+from octasplat.engine.render.image_files import write_png
 from octasplat.engine.runs.run_folder import BLOCKS, CACHE, CHECKPOINTS, CONFIG, SCENE, found_model_folder
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.protocol import Tracer
 from octasplat.workers.worker.job_kinds.reconstruct_kinds import BlockJobConfig, ReconstructJobConfig
 from octasplat.workers.worker.live_scene import LiveSceneWriter
-from octasplat.workers.worker.preview import PreviewRenderer
+from octasplat.workers.worker.preview import PREVIEW_FILE, PreviewRenderer, PreviewWritten
 from octasplat.workers.worker.publishing import path_redactor, publish_file
 from octasplat.workers.worker.task import BlocksPlanned, Task
 
@@ -73,10 +75,29 @@ def _plan_blocks(task: Task, options: ReconstructJobConfig, blocks: BlockRequest
         _run_step(task, options, PlanBlocks(), blocks)
     if (plan := planned_blocks(task.run)) is None or not missing_blocks(task.run, plan):
         return False
+    _show_map(task, options, plan)
     lengths = {number: length for number, length in enumerate(plan.iterations, start=1) if length}
     total = sum(plan.expected_iterations().values())
     task.progress(BlocksPlanned(tuple(lengths), tuple(lengths.values()), plan.coarse_iterations, total))
     return True
+
+
+def _show_map(task: Task, options: ReconstructJobConfig, plan: ScenePlan) -> None:
+    """Let a map of the blocks be the preview, unless the model cannot be read, of which the run tells."""
+    assert task.scene is not None
+    try:
+        model = load_dataset_model(
+            task.scene,
+            model_folder=found_model_folder(task.run),
+            model=options.model,
+            for_training=False,
+        )
+    except OctasplatError:
+        return
+    drawn = draw_block_map(model, [block.core for block in plan.blocks])
+    write_png(task.run / PREVIEW_FILE, drawn.image_srgb)
+    positions = tuple((number, float(x), float(y)) for number, (x, y) in enumerate(drawn.middles, start=1))
+    task.progress(PreviewWritten(PREVIEW_FILE, plan.coarse_iterations, None, positions))
 
 
 def _run_step(

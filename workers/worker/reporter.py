@@ -25,7 +25,7 @@ from octasplat.workers.reporting.events import decode_event, encode_training_pro
 from octasplat.workers.reporting.time_left import TimeLeftEstimator, work_of_stage
 from octasplat.workers.storage.errors import StorageError
 from octasplat.workers.worker.checkpoint import Checkpoint
-from octasplat.workers.worker.task import RUN_FOLDER, BlocksPlanned, read_planned_blocks
+from octasplat.workers.worker.task import RUN_FOLDER, BlocksPlanned, read_block_positions, read_planned_blocks
 from octasplat.workers.worker.workspace import Workspace
 
 logger = logging.getLogger(__name__)
@@ -254,7 +254,7 @@ class Reporter:
         async with storage_lease(self._attempt.pool, self._workspace.storage) as note:
             sha256 = await asyncio.to_thread(self._workspace.store_file, f"{RUN_FOLDER}/{event['path']}")
             row = {"sha256": sha256, "step": event["step"], "view": event["view"]}
-            await self._attempt.record_preview(row, note)
+            await self._attempt.record_preview(row, note, block_positions=read_block_positions(event))
 
     async def _store_live_scene(self, event: Mapping[str, Any]) -> None:
         async with storage_lease(self._attempt.pool, self._workspace.storage) as note:

@@ -66,6 +66,16 @@ def read_planned_blocks(event: Mapping[str, Any]) -> BlocksPlanned | None:
     return BlocksPlanned(tuple(numbers), tuple(iterations), first, total)
 
 
+def read_block_positions(event: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
+    """Return where blocks are on a preview by their numbers; empty where a program does not say so."""
+    try:
+        found = {str(int(number)): (float(x), float(y)) for number, x, y in event.get("block_positions", ())}
+    except (TypeError, ValueError, OverflowError):
+        return {}
+    is_plausible = len(found) <= MAX_BLOCKS and all(0 <= place <= 1 for xy in found.values() for place in xy)
+    return found if is_plausible else {}
+
+
 @dataclass(frozen=True)
 class Task:
     """One job, as its program sees it.

@@ -81,7 +81,7 @@ function hear(kind, data, id, isNew) {
     } else if (kind === "held_out_measured") {
         if (training.addHeldOut(data)) redraw();
         if (isNew) showDecibels("live-psnr", data.psnr);
-    } else if (kind === "preview" && isNew) showPreview(data);
+    } else if (kind === "preview" && isNew && data.view) showPreview(data); // without a view it is a map of blocks
     else if (kind === "live_scene" && isNew) showLiveScene(data);
     else if (kind === "state" && isNew && isOver(data.state)) location.reload();
     else if (isNew) refresh();
