@@ -37,10 +37,11 @@ import psycopg
 from benchmarks.queue_deliveries import QUEUE, empty_database
 from octasplat.engine.core import versions
 from octasplat.workers.db.connections import Pool, open_pool
-from octasplat.workers.queue.attempts import Attempt, FencedError, ResultFile
+from octasplat.workers.queue.attempts import Attempt, FencedError
 from octasplat.workers.queue.block_jobs import NewBlock, files_from_others, settle_root
 from octasplat.workers.queue.claims import claim
 from octasplat.workers.queue.fair_share import choose_job
+from octasplat.workers.queue.job_results import ResultFile
 from octasplat.workers.queue.jobs import NewJob, create_job
 from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
 from octasplat.workers.queue.recovery import StalledAttempts, recover_stalled_jobs

@@ -28,8 +28,9 @@ from octasplat.workers.maintenance.retention import (
     delete_expired,
     update_expiry_times,
 )
-from octasplat.workers.queue.attempts import Attempt, ResultFile
+from octasplat.workers.queue.attempts import Attempt
 from octasplat.workers.queue.claims import claim
+from octasplat.workers.queue.job_results import ResultFile
 from octasplat.workers.queue.jobs import NewJob, artifacts_of, change_job, create_job, get_job, retry_job
 from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
 from octasplat.workers.storage.local import LocalStorage

@@ -12,7 +12,7 @@ from octasplat.workers.db.connections import Pool, open_pool
 from octasplat.workers.db.errors import ConflictError
 from octasplat.workers.db.quotas import Quota, QuotaExceededError, check_new_job, set_quota, usage_of
 from octasplat.workers.db.rows import Job
-from octasplat.workers.queue.attempts import Attempt, FencedError, ResultFile
+from octasplat.workers.queue.attempts import Attempt, FencedError
 from octasplat.workers.queue.block_jobs import (
     NewBlock,
     blocks_of,
@@ -22,10 +22,12 @@ from octasplat.workers.queue.block_jobs import (
     unsettled_roots,
 )
 from octasplat.workers.queue.fair_share import choose_job
+from octasplat.workers.queue.job_results import ResultFile
 from octasplat.workers.queue.jobs import create_job, list_jobs, retry_job
 from octasplat.workers.queue.recovery import StalledAttempts, recover_stalled_jobs
 from octasplat.workers.queue.storage_leases import storage_lease
 from octasplat.workers.queue.usage_figures import running_by_queue
+from octasplat.workers.storage.errors import BlobNotFoundError
 from octasplat.workers.storage.local import LocalStorage
 from tests.support.queue_jobs import NEW, SLIPS, claimed, fetched
 
@@ -166,6 +168,53 @@ async def test_failed_block_ends_the_others_and_the_whole(conninfo: str, folder:
         root = await start(pool, folder, await claimed(pool, await fetched(pool, root.id)), (1, 2, 3))
         assert [block.state for block in await children(pool, root.id)] == ["queued", "queued", "succeeded"]
         assert root.error is None and root.checkpoint is not None
+
+
+@pytest.mark.parametrize("begun", [False, True], ids=["queued", "begun"])
+async def test_job_cancelled_as_its_merge_begins_keeps_its_blocks(
+    conninfo: str, folder: Path, begun: bool
+) -> None:
+    async with open_pool(conninfo, max_size=6) as pool:
+        root = await start(pool, folder, await claimed(pool))
+        for block in await children(pool, root.id):
+            await (await claimed(pool, block)).succeed([], job_queue=SLIPS)
+        root = await fetched(pool, root.id)
+        assert root.state == "queued"
+        merge = await claimed(pool, root) if begun else None
+        async with pool.connection() as connection:
+            await cancel_job(connection, SLIPS, root.id)
+        if merge is not None:
+            assert await merge.read_state() == "canceling"
+            await merge.cancel()
+        assert (await settle(pool, root.id)).state == "canceled"
+        assert {block.state for block in await children(pool, root.id)} == {"succeeded"}
+        async with pool.connection() as connection:
+            assert await unsettled_roots(connection) == []
+            await retry_job(connection, SLIPS, root.id, from_start=False)
+        again = await claimed(pool, await fetched(pool, root.id))
+        await again.succeed([], job_queue=SLIPS)
+        assert (await fetched(pool, root.id)).state == "succeeded"
+
+
+async def test_results_lost_twice_fail_with_the_name_of_the_block(conninfo: str, folder: Path) -> None:
+    async with open_pool(conninfo, max_size=6) as pool:
+        root = await start(pool, folder, await claimed(pool))
+        for trial in range(2):
+            for block in await children(pool, root.id):
+                if block.state == "queued":
+                    digest = str(block.options["number"]) * 64
+                    result = ResultFile("blocks/best.npz", digest, 1, "x")
+                    await (await claimed(pool, block)).succeed([result], job_queue=SLIPS)
+            merge = await claimed(pool, await fetched(pool, root.id))
+            if trial:
+                with pytest.raises(BlobNotFoundError, match="block 2 are gone from the store once more"):
+                    await merge.drop_lost_blocks({"2" * 64})
+                break
+            await merge.drop_lost_blocks({"2" * 64})
+            async with pool.connection() as connection:
+                assert [file.sha256[0] for file in await files_from_others(connection, merge.job)] == ["1"]
+            root = await start(pool, folder, merge)
+            assert [block.state for block in await children(pool, root.id)] == ["succeeded", "queued"]
 
 
 async def test_cancelling_by_a_front_end_of_the_last_version_is_settled(conninfo: str, folder: Path) -> None:

@@ -17,9 +17,10 @@ from octasplat.workers.db.datasets import (
 from octasplat.workers.db.events_and_logs import list_job_events, list_log_lines
 from octasplat.workers.db.locks import lock_owner, lock_store
 from octasplat.workers.maintenance.webhooks.rows import add_endpoint, delete_endpoint
-from octasplat.workers.queue.attempts import FencedError, ResultFile
+from octasplat.workers.queue.attempts import FencedError
 from octasplat.workers.queue.block_jobs import cancel_job
 from octasplat.workers.queue.claims import claim
+from octasplat.workers.queue.job_results import ResultFile
 from octasplat.workers.queue.jobs import change_job, create_job, get_job
 from octasplat.workers.queue.recovery import StalledAttempts, recover_stalled_jobs
 from octasplat.workers.queue.storage_leases import (

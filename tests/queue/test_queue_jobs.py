@@ -8,11 +8,12 @@ import pytest
 from octasplat.workers.db.connections import Connection, Pool, open_pool
 from octasplat.workers.db.errors import ConflictError, NotFoundError
 from octasplat.workers.db.ids import new_id
-from octasplat.workers.queue.attempts import FencedError, ResultFile
+from octasplat.workers.queue.attempts import FencedError
 from octasplat.workers.queue.block_jobs import cancel_job
 from octasplat.workers.queue.claims import claim
 from octasplat.workers.queue.fair_share import queue_position
 from octasplat.workers.queue.job_endings import MAX_SILENT_RECOVERIES
+from octasplat.workers.queue.job_results import ResultFile
 from octasplat.workers.queue.jobs import (
     NewJob,
     artifacts_of,

@@ -14,7 +14,7 @@ from octasplat.service.app import create_app
 from octasplat.service.settings import ServiceSettings
 from octasplat.service.state import Service
 from octasplat.workers.db.live_scenes import LiveScene, put_live_scene
-from octasplat.workers.queue.attempts import ResultFile
+from octasplat.workers.queue.job_results import ResultFile
 from tests.support.api_inventory import Operation, operations, undescribed
 from tests.support.service_harness import (
     ConnectService,

@@ -15,7 +15,7 @@ import pytest
 from octasplat.service.state import Service
 from octasplat.workers.db.migrate import OWN_COMPONENT, all_migrations, migrate
 from octasplat.workers.maintenance.backup import create_backup, restore_backup
-from octasplat.workers.queue.attempts import ResultFile
+from octasplat.workers.queue.job_results import ResultFile
 from octasplat.workers.storage.local import LocalStorage
 from tests.support.model_builder import photograph
 from tests.support.postgres_fixtures import EmbeddedPostgres, copied_database

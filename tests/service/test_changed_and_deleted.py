@@ -17,7 +17,7 @@ from octasplat.service.schemas.jobs import NewJob
 from octasplat.service.settings import ServiceSettings
 from octasplat.service.state import Service
 from octasplat.workers.db import datasets as rows
-from octasplat.workers.queue.attempts import ResultFile
+from octasplat.workers.queue.job_results import ResultFile
 from octasplat.workers.queue.jobs import get_job
 from octasplat.workers.settings import load_settings
 from tests.support.model_builder import photograph

@@ -15,7 +15,7 @@ from octasplat.service.request_id import RequestIdFilter
 from octasplat.service.state import Service
 from octasplat.service.zip_stream import ZipEntry, stream_zip
 from octasplat.workers.db.quotas import Quota, set_quota
-from octasplat.workers.queue.attempts import ResultFile
+from octasplat.workers.queue.job_results import ResultFile
 from tests.support.service_harness import (
     ConnectService,
     claim_job,

@@ -11,7 +11,7 @@ import pytest
 
 from octasplat.service import downloads
 from octasplat.service.state import Service
-from octasplat.workers.queue.attempts import ResultFile
+from octasplat.workers.queue.job_results import ResultFile
 from tests.service.test_backup import octasplat
 from tests.support.service_harness import ConnectService, claim_job, new_job, running_service, store_content
 

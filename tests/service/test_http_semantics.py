@@ -8,7 +8,7 @@ from octasplat.service.app import create_app
 from octasplat.service.settings import ServiceSettings
 from octasplat.workers.db.holds import set_worker_drained
 from octasplat.workers.db.workers import record_worker_heartbeat
-from octasplat.workers.queue.attempts import ResultFile
+from octasplat.workers.queue.job_results import ResultFile
 from tests.support.api_inventory import operations
 from tests.support.service_harness import (
     ConnectService,

@@ -9,7 +9,7 @@ from typing import Any
 import httpx
 import pytest
 
-from octasplat.workers.queue.attempts import ResultFile
+from octasplat.workers.queue.job_results import ResultFile
 from tests.support.service_harness import (
     ConnectService,
     claim_job,

@@ -10,7 +10,7 @@ from octasplat.service.state import Service
 from octasplat.workers.db.datasets import put_file
 from octasplat.workers.db.locks import lock_owner
 from octasplat.workers.db.workers import record_worker_heartbeat
-from octasplat.workers.queue.attempts import ResultFile
+from octasplat.workers.queue.job_results import ResultFile
 from octasplat.workers.queue.jobs import get_job, requeue_job
 from tests.support.service_harness import (
     ConnectService,

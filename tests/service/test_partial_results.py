@@ -18,7 +18,7 @@ from octasplat.service.state import Service
 from octasplat.workers.client.submission import Submission, submit
 from octasplat.workers.client.watch import watch_job
 from octasplat.workers.db.workers import record_worker_heartbeat
-from octasplat.workers.queue.attempts import ResultFile
+from octasplat.workers.queue.job_results import ResultFile
 from tests.support.service_harness import ConnectService, claim_job, committed_dataset
 
 FORMATS = [exporter.name for exporter in exporters()]

@@ -8,7 +8,7 @@ import pytest
 from octasplat.service.actions import commits as actions
 from octasplat.service.intake.dataset import DatasetSummary
 from octasplat.service.state import Service
-from octasplat.workers.queue.attempts import ResultFile
+from octasplat.workers.queue.job_results import ResultFile
 from tests.support.model_builder import photograph
 from tests.support.service_harness import (
     ConnectService,

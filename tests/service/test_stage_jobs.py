@@ -26,7 +26,7 @@ from octasplat.engine.render.image_files import write_png
 from octasplat.service.state import Service
 from octasplat.workers.cli.main import cli
 from octasplat.workers.db.locks import lock_owner
-from octasplat.workers.queue.attempts import ResultFile
+from octasplat.workers.queue.job_results import ResultFile
 from tests.support.service_harness import (
     ConnectService,
     claim_job,

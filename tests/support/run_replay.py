@@ -10,8 +10,9 @@ from typing import Any
 from octasplat.workers.db.connections import open_pool
 from octasplat.workers.db.events_and_logs import add_event
 from octasplat.workers.db.live_scenes import LiveScene, put_live_scene
-from octasplat.workers.queue.attempts import Attempt, ResultFile
+from octasplat.workers.queue.attempts import Attempt
 from octasplat.workers.queue.claims import claim
+from octasplat.workers.queue.job_results import ResultFile
 from octasplat.workers.queue.jobs import get_job
 from octasplat.workers.reporting.events import encode_training_progress
 from octasplat.workers.storage.local import LocalStorage

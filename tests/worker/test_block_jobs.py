@@ -11,7 +11,7 @@ from octasplat.workers.db.errors import ConflictError
 from octasplat.workers.db.quotas import usage_of
 from octasplat.workers.db.rows import Job
 from octasplat.workers.queue.block_jobs import blocks_of
-from octasplat.workers.queue.jobs import delete_job, list_jobs
+from octasplat.workers.queue.jobs import artifacts_of, delete_job, list_jobs
 from tests.support.worker_harness import WorkerHarness
 
 KINDS: dict[str, Any] = {"KIND_MODULES": '["tests.support.toy_kind", "tests.support.block_toys"]'}
@@ -84,6 +84,30 @@ def test_worker_killed_during_a_block_is_replaced(bench: WorkerHarness) -> None:
     assert children[2].attempt >= 2
     resumed = [event for event in bench.events(children[2].id) if event.kind == "resumed"]
     assert resumed[0].data["step"] == 5
+
+
+@pytest.mark.parametrize("damage", ["gone", "damaged"])
+def test_results_lost_from_the_store_are_made_again(bench: WorkerHarness, damage: str) -> None:
+    for number in range(2):
+        bench.worker(name=f"w{number}", **KINDS)
+    root = submit(bench, hold=3)
+    bench.wait(root, lambda _: states(bench, root) == ["succeeded", "succeeded", "running"])
+    first = blocks(bench, root)[0]
+    results = bench.run_query(lambda c: artifacts_of(c, first.id))
+    [sha256] = [result.sha256 for result in results if result.name.endswith("best.npz")]
+    [stored] = (bench.folder / "store").rglob(sha256)
+    if damage == "gone":
+        stored.unlink()
+    else:
+        stored.chmod(0o600)
+        stored.write_bytes(b"9:99")
+    bench.open_gate()
+    job = bench.wait_until_finished(root)
+    assert (job.state, job.error) == ("succeeded", None) and bench.results(root) == {"sum.txt": DONE}
+    assert [child.attempt for child in blocks(bench, root)] == [2, 1, 1]
+    warnings = [event.data["message"] for event in bench.events(root) if event.kind == "warning"]
+    assert warnings == ["The results of block 1 are gone from the store; it is trained again."]
+    assert job.count_starts(job.attempt) == 1
 
 
 def test_failed_block_fails_the_whole_and_a_retry_keeps_what_succeeded(bench: WorkerHarness) -> None:

@@ -11,8 +11,8 @@ import pytest
 import octasplat as osp
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.workers.db.connections import open_pool
-from octasplat.workers.queue.attempts import ResultFile
 from octasplat.workers.queue.claims import claim
+from octasplat.workers.queue.job_results import ResultFile
 from octasplat.workers.storage.factory import open_storage
 from octasplat.workers.storage.trees import store_tree
 from octasplat.workers.worker.job_kinds import get_job_kind

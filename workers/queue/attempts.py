@@ -19,11 +19,13 @@ from octasplat.workers.db.rows import Job
 from octasplat.workers.queue.block_jobs import (
     ROOT,
     NewBlock,
+    drop_lost_blocks,
     forget_block_results,
     release_needs,
     start_blocks,
 )
 from octasplat.workers.queue.job_endings import MAX_RECOVERIES, count_requeues, end_job, recover_attempt
+from octasplat.workers.queue.job_results import ResultFile, replace_artifacts, result_digests
 from octasplat.workers.queue.jobs import get_job, requeue_job
 from octasplat.workers.queue.protocol import JobQueue
 from octasplat.workers.queue.storage_leases import StorageLease
@@ -31,16 +33,6 @@ from octasplat.workers.queue.storage_leases import StorageLease
 
 class FencedError(Exception):
     """The attempt is over: the job has continued without this worker."""
-
-
-@dataclass(frozen=True)
-class ResultFile:
-    """A result to publish: its name, content and media type."""
-
-    name: str
-    sha256: str
-    size_bytes: int
-    media_type: str
 
 
 @dataclass(frozen=True)
@@ -184,7 +176,7 @@ class Attempt:
         async with self._fenced_transaction(changes_usage=True) as (connection, job):
             if psnr is not None:
                 await connection.execute("UPDATE jobs SET psnr = %s WHERE id = %s", [psnr, job.id])
-            await _replace_artifacts(connection, job, results)
+            await replace_artifacts(connection, job, results)
             await end_job(connection, job, "succeeded", None)
             if job.role == ROOT:
                 await forget_block_results(connection, job)
@@ -230,6 +222,17 @@ class Attempt:
                 connection, job_queue, job, kind, blocks, first_steps=first_steps, total_steps=total_steps
             )
 
+    async def drop_lost_blocks(self, lost: Collection[str]) -> None:
+        """Let blocks be trained again of whose results the store has lost contents of these digests.
+
+        Raises:
+            BlobNotFoundError: results of the same block were lost before.
+        """
+        if not lost:
+            return
+        async with self._fenced_transaction(changes_usage=True) as (connection, job):
+            await drop_lost_blocks(connection, job, lost)
+
     async def fail(
         self,
         error: Mapping[str, Any],
@@ -250,18 +253,18 @@ class Attempt:
             StorageUnavailableError: ``lease``, under which they were stored, was given up.
             QuotaExceededError: the job's owner may not store as much.
         """
-        async with self._fenced_transaction(lease, _result_digests(results), changes_usage=bool(results)) as (
+        async with self._fenced_transaction(lease, result_digests(results), changes_usage=bool(results)) as (
             connection,
             job,
         ):
             if results:
-                await _replace_artifacts(connection, job, results)
+                await replace_artifacts(connection, job, results)
                 await check_bytes(connection, job.owner, self.quota)
             await end_job(connection, job, "failed", self.redact(dict(error)))
             # Collected soon, like contents that were replaced.
             await connection.execute(
                 "INSERT INTO replaced_contents (sha256) SELECT unnest(%s::text[]) ON CONFLICT DO NOTHING",
-                [sorted(_result_digests(discarded))],
+                [sorted(result_digests(discarded))],
             )
 
     async def cancel(self) -> None:
@@ -320,7 +323,7 @@ class Attempt:
         """
         # Both change what the owner stores, for which the owner's lock is taken first.
         counts = drop_checkpoint or bool(results)
-        async with self._fenced_transaction(lease, _result_digests(results), changes_usage=counts) as (
+        async with self._fenced_transaction(lease, result_digests(results), changes_usage=counts) as (
             connection,
             job,
         ):
@@ -337,7 +340,7 @@ class Attempt:
             if failed and drop_checkpoint:
                 await connection.execute("UPDATE jobs SET checkpoint = NULL WHERE id = %s", [job.id])
             if failed and results:
-                await _replace_artifacts(connection, job, results)
+                await replace_artifacts(connection, job, results)
                 await check_bytes(connection, job.owner, self.quota)
 
     @asynccontextmanager
@@ -375,25 +378,3 @@ class Attempt:
 async def _transaction(pool: Pool) -> AsyncIterator[Connection]:
     async with pool.connection() as connection, connection.transaction():
         yield connection
-
-
-def _result_digests(results: Sequence[ResultFile]) -> set[str]:
-    return {result.sha256 for result in results}
-
-
-async def _replace_artifacts(connection: Connection, job: Job, results: Sequence[ResultFile]) -> None:
-    """Replace the results of a job; the one place where they become visible."""
-    await connection.execute("DELETE FROM artifacts WHERE job_id = %s", [job.id])
-    await connection.execute(
-        """
-        INSERT INTO artifacts (job_id, name, sha256, size_bytes, media_type)
-        SELECT %s, given.* FROM unnest(%s::text[], %s::text[], %s::bigint[], %s::text[]) AS given
-        """,
-        [
-            job.id,
-            [result.name for result in results],
-            [result.sha256 for result in results],
-            [result.size_bytes for result in results],
-            [result.media_type for result in results],
-        ],
-    )

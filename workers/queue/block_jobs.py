@@ -9,7 +9,7 @@ Rows are locked in the order of the children's ids, and the root's after them.
 """
 
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,13 +17,15 @@ from octasplat.engine.core import versions
 from octasplat.engine.core.errors import CheckpointError
 from octasplat.workers.db.connections import Connection, fetch_all
 from octasplat.workers.db.errors import ConflictError, NotFoundError
-from octasplat.workers.db.events_and_logs import add_event
+from octasplat.workers.db.events_and_logs import add_event, add_log_lines
 from octasplat.workers.db.locks import about_to_lock_jobs
 from octasplat.workers.db.postgres_text import as_json
 from octasplat.workers.db.rows import Job
 from octasplat.workers.queue.job_endings import end_job
+from octasplat.workers.queue.job_results import replace_artifacts
 from octasplat.workers.queue.jobs import NewJob, create_job, get_job, requeue_job
 from octasplat.workers.queue.protocol import JobQueue
+from octasplat.workers.storage.errors import BlobNotFoundError
 from octasplat.workers.storage.trees import TreeFile
 
 ROOT, BLOCK = "root", "block"
@@ -205,6 +207,45 @@ async def files_from_others(connection: Connection, job: Job) -> list[TreeFile]:
         TreeFile(path=f"{RUN_PREFIX}/{row['name']}", sha256=row["sha256"], size_bytes=row["size_bytes"])
         for row in await cursor.fetchall()
     ]
+
+
+async def drop_lost_blocks(connection: Connection, root: Job, lost: Collection[str]) -> None:
+    """Let the blocks be trained again whose results the store has lost; the caller holds the job's lock.
+
+    They are over without success afterwards, and queued when the job that is being merged plans its blocks.
+
+    Args:
+        connection: of the transaction.
+        root: the job.
+        lost: digests of the contents.
+
+    Raises:
+        BlobNotFoundError: results of the same block were lost before.
+    """
+    query = """
+        SELECT {} FROM jobs WHERE root_id = %s AND state = 'succeeded' AND EXISTS (
+            SELECT FROM artifacts WHERE job_id = jobs.id AND sha256 = ANY(%s)) ORDER BY id FOR UPDATE
+        """
+    for child in await fetch_all(connection, Job, query, [root.id, list(lost)]):
+        number = int(child.options["number"])
+        message = f"The results of block {number} are gone from the store; it is trained again."
+        cursor = await connection.execute(
+            """
+            SELECT id FROM job_events
+            WHERE job_id = %s AND attempt > %s AND kind = 'warning' AND data->>'message' = %s
+            """,
+            [root.id, root.fresh_after, message],
+        )
+        if await cursor.fetchone() is not None:
+            raise BlobNotFoundError(f"The results of block {number} are gone from the store once more.")
+        error = {"type": BlobNotFoundError.error_type, "message": message}
+        await replace_artifacts(connection, child, [])
+        await connection.execute(
+            "UPDATE jobs SET state = 'failed', error = %s, fresh_after = attempt WHERE id = %s",
+            [as_json(error), child.id],
+        )
+        await add_event(connection, root.id, root.attempt, "warning", {"message": message})
+        await add_log_lines(connection, root.id, root.attempt, [f"Warning: {message}"])
 
 
 async def forget_block_results(connection: Connection, root: Job) -> None:

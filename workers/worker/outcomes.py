@@ -10,9 +10,10 @@ from pydantic import BaseModel
 
 from octasplat.engine.core.errors import OctasplatError
 from octasplat.workers.db.quotas import QuotaExceededError
-from octasplat.workers.queue.attempts import Attempt, ResultFile
+from octasplat.workers.queue.attempts import Attempt
 from octasplat.workers.queue.block_jobs import NewBlock
 from octasplat.workers.queue.job_endings import MAX_RECOVERIES
+from octasplat.workers.queue.job_results import ResultFile
 from octasplat.workers.queue.storage_leases import StorageLease, storage_lease
 from octasplat.workers.storage.disk_space import SpaceUsage
 from octasplat.workers.storage.errors import (

@@ -58,7 +58,6 @@ class Supervisor:
         attempt: the claimed job.
         context: the worker.
         claimed_at: when the claim was asked for, by ``time.monotonic()``.
-
     """
 
     def __init__(self, attempt: Attempt, context: WorkerContext, claimed_at: float) -> None:
@@ -192,7 +191,8 @@ class Supervisor:
         is_restored = checkpoint is not None and await self._restore(checkpoint)
         # What blocks have made goes with the plan that is in the checkpoint.
         if others and (job.root_id is not None or is_restored):
-            await asyncio.to_thread(self._workspace.fetch_from_others, others)
+            lost = await asyncio.to_thread(self._workspace.fetch_from_others, others)
+            await self._attempt.drop_lost_blocks(lost)
         self._reporter.set_stages(kind.stages(options))
         await compile_for_job(
             request_groups(kind.name, options),

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import logging
 import math
 import os
 import re
@@ -13,9 +14,14 @@ from pathlib import Path
 from typing import IO
 
 from octasplat.workers.db.rows import Artifact, DatasetFile, Job
-from octasplat.workers.queue.attempts import ResultFile
+from octasplat.workers.queue.job_results import ResultFile
 from octasplat.workers.sandbox.job_users import JobUser, give_folder, open_for_reading, take_user
-from octasplat.workers.storage.errors import StorageError, UntrustedFileError
+from octasplat.workers.storage.errors import (
+    BlobNotFoundError,
+    DigestMismatchError,
+    StorageError,
+    UntrustedFileError,
+)
 from octasplat.workers.storage.folder_removal import remove_folder
 from octasplat.workers.storage.os_errors import translate_os_errors
 from octasplat.workers.storage.protocol import Storage
@@ -35,6 +41,7 @@ from octasplat.workers.worker.stored_frames import StoredFrames, removes_stored_
 from octasplat.workers.worker.task import FILES_FOLDER, RESULTS_FOLDER, RUN_FOLDER
 from octasplat.workers.worker.workspace_locks import LOCK_FILE, lock_dataset_folder, open_locked
 
+logger = logging.getLogger(__name__)
 POSES_FOLDER = "poses"
 """Poses that the engine found, in its output folder and among the results."""
 
@@ -187,13 +194,30 @@ class Workspace:
         files = self.stored_frames.adopt(checkpoint.files, self.storage)
         fetch_tree(self.storage, files, self.folder, writable=True)
 
-    def fetch_from_others(self, files: Sequence[TreeFile]) -> None:
+    def fetch_from_others(self, files: Sequence[TreeFile]) -> set[str]:
         """Fetch what other jobs have made for this one, by its place in the folder.
 
+        Returns:
+            Digests of what is gone or damaged; of the blocks that made it nothing is there.
+
         Raises:
-            StorageError: some of it is gone or damaged.
+            BlobNotFoundError: it is what a block begins with.
         """
-        fetch_tree(self.storage, files, self.folder, writable=True)
+        lost: list[TreeFile] = []
+        for file in files:
+            try:
+                fetch_tree(self.storage, [file], self.folder, writable=True)
+            except (BlobNotFoundError, DigestMismatchError) as error:
+                logger.warning("%s is lost: %s", file.path, error)
+                lost.append(file)
+        if lost and self._own_block is not None:
+            raise BlobNotFoundError(
+                f"What the blocks begin with is gone from the store ({lost[0].path}); retry the job from the "
+                "start."
+            )
+        for file in lost:
+            remove_folder((self.folder / file.path).parent)
+        return {file.sha256 for file in lost}
 
     def discard_run(self) -> None:
         """Discard what was restored."""
