@@ -1,6 +1,6 @@
 """Merge of the blocks of a scene, and the training that follows: of all together, or of what is near cuts."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +21,7 @@ from octasplat.engine.core.errors import CancelledError
 from octasplat.engine.core.events import Noted
 from octasplat.engine.gaussians.merge import with_sh_degree
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
+from octasplat.engine.gaussians.simplification import simplify
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import Tracer
@@ -62,14 +63,15 @@ def finish_scene(work: BlockWork, plan: ScenePlan, tell: PieceProgress) -> Block
         CancelledError: stopped as asked.
     """
     coarse = load_best(work.folder / COARSE)
-    cores = [_core_of_block(work, plan, number, coarse) for number in range(1, len(plan.blocks) + 1)]
+    numbers = range(1, len(plan.blocks) + 1)
+    cores = _limit_cores(work.config, [_core_of_block(work, plan, number, coarse) for number in numbers])
     is_near_cut = np.concatenate(
         [
             ~block.core.grown(-block.margin_world).contains(core.means_world)
             for block, core in zip(plan.blocks, cores, strict=True)
         ]
     )
-    merged = concatenate([with_sh_degree(core, work.config.sh_degree) for core in cores])
+    merged = concatenate(cores)
     del cores
     if plan.is_finished_together:
         finished = _finish(work, merged, coarse, tell, plan.last_iterations)
@@ -84,7 +86,23 @@ def _core_of_block(work: BlockWork, plan: ScenePlan, number: int, coarse: BestSt
     """Return the Gaussians of a block's core; those of the coarse scene where few views show it."""
     block = plan.blocks[number - 1]
     found = load_best(work.folder / block_name(number)) if block.is_trained else coarse
-    return found.gaussians.select(block.core.contains(found.gaussians.means_world))
+    core = found.gaussians.select(block.core.contains(found.gaussians.means_world))
+    return with_sh_degree(core, work.config.sh_degree)
+
+
+def _limit_cores(config: TrainConfig, cores: Sequence[FlatGaussians]) -> list[FlatGaussians]:
+    """Return the cores with as many Gaussians as the whole scene may have; those that look alike are merged.
+
+    Blocks share that number by what they and their margins show, so that the cores may have a few more.
+    """
+    ends = np.cumsum([len(core) for core in cores])
+    if not 0 < config.max_gaussians < ends[-1]:
+        return list(cores)
+    counts = np.diff(ends * config.max_gaussians // ends[-1], prepend=0).tolist()
+    return [
+        simplify(core, max(1, count)) if len(core) else core
+        for core, count in zip(cores, counts, strict=True)
+    ]
 
 
 def _finish(
