@@ -127,19 +127,22 @@ def test_merged_scene_numbers_one_core_after_the_other(scene: Path, polished_blo
     coarse = load_best(run / "blocks" / "coarse").gaussians
     tracer = make_tracer(make_config().train.trace, threads=1)
     blocks = plan_blocks(dataset, coarse, 2, tracer, lambda: None)
-    first = 0
+    cores = []
     for number, block in enumerate(blocks, start=1):
         trained = load_best(run / "blocks" / f"block_{number:03d}").gaussians
-        core = trained.select(block.core.contains(trained.means_world))
-        part = merged.select(slice(first, first + len(core)))
-        first += len(core)
+        cores.append(trained.select(block.core.contains(trained.means_world)))
+    total = sum(len(core) for core in cores)
+    assert 2000 < total < 1.2 * 2000 and len(merged) == 2000  # pairs that look alike became one
+    first = 0
+    for block, core in zip(blocks, cores, strict=True):
+        count = round(2000 * len(core) / total)
+        part = merged.select(slice(first, first + count))
+        first += count
         is_inner = block.core.grown(-block.margin_world).contains(core.means_world)
         assert 0 < is_inner.sum() < len(core)
-        np.testing.assert_array_equal(part.means_world[is_inner], core.means_world[is_inner])
-        np.testing.assert_array_equal(part.sh[is_inner], core.sh[is_inner])
-        assert np.abs(part.sh[~is_inner] - core.sh[~is_inner]).max() > 0  # the polish has moved these
-    assert first == len(merged)
-    assert len(merged) < 1.2 * 2000
+        stays = [np.isin(core.sh[rows, 0, 0], part.sh[:, 0, 0]).sum() for rows in (is_inner, ~is_inner)]
+        assert is_inner.sum() - stays[0] <= 2 * (len(core) - count)
+        assert stays[1] < 0.1 * (~is_inner).sum()  # the polish has moved these
 
 
 def test_progress_counts_all_trainings(two_blocks: tuple) -> None:
