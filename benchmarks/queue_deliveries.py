@@ -3,7 +3,8 @@
     python -m benchmarks.queue_deliveries --queued 1000 10000 100000 --owners 10
 
 Prints JSON: for each count, milliseconds of a delivery (median and 95th percentile) in its parts: to be
-given an entry, to choose the job by the fair share, to begin it, to end it, and to tell how many are ahead.
+given an entry, to choose the job by the fair share, to begin it, to end it, and to tell how many are ahead;
+besides, a heartbeat and a row of progress, which each running job writes all the time.
 Jobs do no work; one worker takes them one after the other. The database is a private one without flushing.
 """
 
@@ -78,6 +79,11 @@ async def measure(pool: Pool, deliveries: int) -> dict[str, dict[str, float]]:
         marks.append(("begin", time.perf_counter()))
         attempt = await claim(pool, *chosen, "worker")
         assert attempt is not None
+        marks.append(("heartbeat", time.perf_counter()))
+        await attempt.heartbeat()
+        marks.append(("progress", time.perf_counter()))
+        step = {"iteration": 10, "total_iterations": 100, "seconds_left": 1.0}
+        await attempt.set_progress(stage="train", step=10, total_steps=100, event=step)
         marks.append(("end", time.perf_counter()))
         await attempt.succeed([], job_queue=queue)
         marks.append(("", time.perf_counter()))

@@ -35,8 +35,8 @@ def test_manifest_fits_the_schemas_of_kubernetes() -> None:
     for document in documents():
         kubernetes_validate.validate(document, newest, strict=True)
     broken = next(found for found in documents() if found["kind"] == "Deployment")
-    broken["spec"]["template"]["spec"]["containers"][0]["comand"] = ["x"]
-    with pytest.raises(kubernetes_validate.ValidationError, match="comand"):
+    broken["spec"]["template"]["spec"]["containers"][0]["unheard_of"] = ["x"]
+    with pytest.raises(kubernetes_validate.ValidationError, match="unheard_of"):
         kubernetes_validate.validate(broken, newest, strict=True)
 
 

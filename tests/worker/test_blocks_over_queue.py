@@ -140,4 +140,5 @@ def test_block_that_the_store_lost_fails_the_job_by_name(bench: WorkerHarness, s
     open_storage(bench.folder / "store").delete(plan)
     job = bench.wait_until_finished(root, MAX_WAIT_SECONDS)
     assert job.state == "failed" and job.error is not None
-    assert job.error["message"].startswith("Block ") and plan[:8] in job.error["message"]
+    assert job.error["message"].startswith("Block ")
+    assert "run/blocks/plan.npz" in job.error["message"] and "from the start" in job.error["message"]
