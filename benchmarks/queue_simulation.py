@@ -1,10 +1,10 @@
 """Jobs in blocks without work: thousands of them, workers that are killed, and whether anything is lost.
 
-    python -m benchmarks.queue_simulation --roots 20 --blocks 500 --workers 20 --kills 60
+    python -m benchmarks.queue_simulation --roots 20 --blocks 500 --processes 5 --workers 4 --kills 60
 
-Prints a report as JSON; exit code 1 if there are faults. Workers are processes that take jobs as real ones do
-(fair choice, claim, heartbeats, fenced success, recovery) but do no work; some are killed (SIGKILL) at any
-moment and started again. What must hold at the end:
+Prints a report as JSON; exit code 1 if there are faults. Workers take jobs as real ones do (fair choice,
+claim, fenced success, recovery) but do no work. They share processes, some of which are killed (SIGKILL) at
+any moment and started again. What must hold at the end:
 
 * every job is done, and told of it once;
 * each whole was put back into the queue once by its blocks, and found the result of each of them;
@@ -177,10 +177,11 @@ class SimulatedWorker:
         return "merge"
 
 
-async def work(conninfo: str, folder: Path, log: Path) -> None:
-    """Be a worker."""
-    async with open_pool(conninfo, max_size=4) as pool:
-        await SimulatedWorker(pool, folder, log).run()
+async def work(conninfo: str, folder: Path, log: Path, count: int) -> None:
+    """Be so many workers."""
+    async with open_pool(conninfo, max_size=4 * count) as pool, asyncio.TaskGroup() as group:
+        for _ in range(count):
+            group.create_task(SimulatedWorker(pool, folder, log).run())
 
 
 async def queue_roots(conninfo: str, roots: int, blocks: int, owners: int) -> None:
@@ -204,13 +205,15 @@ class Simulation:
         conninfo: the database.
         database: folder of its data.
         folder: for the store and the logs.
-        workers: how many.
+        processes: how many.
+        workers: in each of them.
         seed: decides who is killed and when.
     """
 
     conninfo: str
     database: Path
     folder: Path
+    processes: int
     workers: int
     seed: int
     killed: int = 0
@@ -221,14 +224,14 @@ class Simulation:
     def run(self, kills: int, seconds_between: float) -> float:
         """Let the workers do everything; returns the seconds that it took."""
         chance = random.Random(self.seed)
-        self._processes = [self._start(number) for number in range(self.workers)]
+        self._processes = [self._start(number) for number in range(self.processes)]
         begun = last = time.monotonic()
         try:
             with psycopg.connect(self.conninfo, autocommit=True) as connection:
                 while _number(connection, "SELECT count(*) FROM jobs WHERE state <> 'succeeded'"):
                     if self.killed < kills and time.monotonic() - last >= seconds_between:
                         last = time.monotonic()
-                        self._kill(chance.randrange(self.workers))
+                        self._kill(chance.randrange(self.processes))
                     self._look_at_database()
                     time.sleep(0.2)
         finally:
@@ -240,9 +243,10 @@ class Simulation:
 
     def _start(self, number: int) -> "subprocess.Popen[bytes]":
         command = ["-m", "benchmarks.queue_simulation", "--work", self.conninfo, str(self.folder)]
+        size = ["--workers", str(self.workers)]
         log = self.folder / f"worker-{number}.jsonl"
         with (self.folder / f"worker-{number}.log").open("ab") as errors:
-            return subprocess.Popen([sys.executable, *command, str(log)], stderr=errors)
+            return subprocess.Popen([sys.executable, *command, str(log), *size], stderr=errors)
 
     def _kill(self, number: int) -> None:
         self._processes[number].kill()
@@ -324,15 +328,16 @@ def main() -> None:
     parser.add_argument("--roots", type=int, default=20)
     parser.add_argument("--blocks", type=int, default=500, help="of each root")
     parser.add_argument("--owners", type=int, default=4)
-    parser.add_argument("--workers", type=int, default=20)
+    parser.add_argument("--processes", type=int, default=5)
+    parser.add_argument("--workers", type=int, default=4, help="in each process")
     parser.add_argument("--kills", type=int, default=60)
     parser.add_argument("--seconds-between", type=float, default=2.0, help="two kills")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--work", nargs=3, metavar=("CONNINFO", "FOLDER", "LOG"), help="be a worker")
+    parser.add_argument("--work", nargs=3, metavar=("CONNINFO", "FOLDER", "LOG"), help="be workers")
     arguments = parser.parse_args()
     if arguments.work:
         conninfo, folder, log = arguments.work
-        asyncio.run(work(conninfo, Path(folder), Path(log)))
+        asyncio.run(work(conninfo, Path(folder), Path(log), arguments.workers))
         return
     with tempfile.TemporaryDirectory(prefix="octasplat-queue-") as name:
         folder = Path(name)
@@ -342,7 +347,12 @@ def main() -> None:
             asyncio.run(queue_roots(conninfo, arguments.roots, arguments.blocks, arguments.owners))
             (folder / "store").mkdir()
             simulation = Simulation(
-                conninfo, server.home, folder / "store", arguments.workers, arguments.seed
+                conninfo,
+                server.home,
+                folder / "store",
+                arguments.processes,
+                arguments.workers,
+                arguments.seed,
             )
             found = report(simulation, simulation.run(arguments.kills, arguments.seconds_between))
         finally:

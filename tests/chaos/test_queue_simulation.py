@@ -18,7 +18,7 @@ def test_blocks_without_work_survive_kills_of_their_workers(short_root: Path) ->
     store.mkdir()
     try:
         asyncio.run(queue_roots(conninfo, roots=2, blocks=10, owners=2))
-        simulation = Simulation(conninfo, server.home, store, workers=3, seed=1)
+        simulation = Simulation(conninfo, server.home, store, processes=2, workers=2, seed=1)
         found = report(simulation, simulation.run(kills=2, seconds_between=4.0))
         assert (found["jobs"], found["faults"]) == (22, {})
         # What must hold is looked at: a block that is told of twice is a fault.
