@@ -18,6 +18,7 @@ import asyncio
 import contextlib
 import hashlib
 import json
+import os
 import random
 import resource
 import signal
@@ -242,11 +243,15 @@ class Simulation:
         return ended - begun
 
     def _start(self, number: int) -> "subprocess.Popen[bytes]":
-        command = ["-m", "benchmarks.queue_simulation", "--work", self.conninfo, str(self.folder)]
+        command = ["-m", "benchmarks.queue_simulation", "--work", str(self.folder)]
         size = ["--workers", str(self.workers)]
         log = self.folder / f"worker-{number}.jsonl"
         with (self.folder / f"worker-{number}.log").open("ab") as errors:
-            return subprocess.Popen([sys.executable, *command, str(log), *size], stderr=errors)
+            return subprocess.Popen(
+                [sys.executable, *command, str(log), *size],
+                env={**os.environ, "DATABASE_URL": self.conninfo},
+                stderr=errors,
+            )
 
     def _kill(self, number: int) -> None:
         self._processes[number].kill()
@@ -333,11 +338,11 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=60)
     parser.add_argument("--seconds-between", type=float, default=2.0, help="two kills")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--work", nargs=3, metavar=("CONNINFO", "FOLDER", "LOG"), help="be workers")
+    parser.add_argument("--work", nargs=2, metavar=("FOLDER", "LOG"), help="be workers")
     arguments = parser.parse_args()
     if arguments.work:
-        conninfo, folder, log = arguments.work
-        asyncio.run(work(conninfo, Path(folder), Path(log), arguments.workers))
+        folder, log = arguments.work
+        asyncio.run(work(os.environ["DATABASE_URL"], Path(folder), Path(log), arguments.workers))
         return
     with tempfile.TemporaryDirectory(prefix="octasplat-queue-") as name:
         folder = Path(name)

@@ -16,9 +16,16 @@ async def add_event(
     connection: Connection, job_id: uuid.UUID, attempt: int, kind: str, data: Mapping[str, Any]
 ) -> None:
     """Add an event; listeners on :data:`CHANNEL` are notified when the transaction commits."""
+    await add_events(connection, [job_id], attempt, kind, data)
+
+
+async def add_events(
+    connection: Connection, job_ids: Sequence[uuid.UUID], attempt: int, kind: str, data: Mapping[str, Any]
+) -> None:
+    """Add the same event to several jobs."""
     await connection.execute(
-        "INSERT INTO job_events (job_id, attempt, kind, data) VALUES (%s, %s, %s, %s)",
-        [job_id, attempt, kind, as_json(dict(data))],
+        "INSERT INTO job_events (job_id, attempt, kind, data) SELECT unnest(%s::uuid[]), %s, %s, %s",
+        [list(job_ids), attempt, kind, as_json(dict(data))],
     )
 
 

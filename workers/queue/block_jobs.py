@@ -23,7 +23,7 @@ from octasplat.workers.db.postgres_text import as_json
 from octasplat.workers.db.rows import Job
 from octasplat.workers.queue.job_endings import end_job
 from octasplat.workers.queue.job_results import replace_artifacts
-from octasplat.workers.queue.jobs import NewJob, create_job, get_job, requeue_job
+from octasplat.workers.queue.jobs import NewJob, create_jobs, get_job, requeue_job
 from octasplat.workers.queue.protocol import JobQueue
 from octasplat.workers.storage.errors import BlobNotFoundError
 from octasplat.workers.storage.trees import TreeFile
@@ -81,25 +81,27 @@ async def start_blocks(
         else:
             await connection.execute("DELETE FROM jobs WHERE id = %s", [child.id])
     # The longest first, so that none is left over in the end.
-    for block in sorted(blocks, key=lambda block: (-block.iterations, block.number)):
-        known = kept.get(block.number)
-        if known is None:
-            child = await create_job(connection, job_queue, _job_of_block(root, kind, block))
-        elif known.state == "succeeded":
+    ordered = sorted(blocks, key=lambda block: (-block.iterations, block.number))
+    needed = []
+    for known in (kept[block.number] for block in ordered if block.number in kept):
+        if known.state == "succeeded":
             continue
-        elif (child := known).is_over:
+        if known.is_over:
             await connection.execute(
                 """
                 UPDATE jobs SET rescues = 0, error = NULL, finished_at = NULL, stage = NULL, step = NULL,
                     total_steps = NULL WHERE id = %s
                 """,
-                [child.id],
+                [known.id],
             )
-            await requeue_job(connection, job_queue, replace(child, place=root.place_in_queue))
-        await connection.execute(
-            "INSERT INTO job_needs (job_id, needs_id) VALUES (%s, %s) ON CONFLICT DO NOTHING",
-            [root.id, child.id],
-        )
+            await requeue_job(connection, job_queue, replace(known, place=root.place_in_queue))
+        needed.append(known.id)
+    new = [_job_of_block(root, kind, block) for block in ordered if block.number not in kept]
+    needed += await create_jobs(connection, job_queue, new)
+    await connection.execute(
+        "INSERT INTO job_needs (job_id, needs_id) SELECT %s, unnest(%s::uuid[]) ON CONFLICT DO NOTHING",
+        [root.id, needed],
+    )
     await connection.execute(
         """
         UPDATE jobs SET role = %s, heartbeat_at = NULL, worker = NULL, seconds_left = NULL, rescues = 0,

@@ -5,12 +5,12 @@ Every function takes a connection and works in one transaction of its own or of 
 
 import uuid
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Literal, LiteralString
 
 from octasplat.workers.db.connections import Connection, fetch_all, fetch_one
 from octasplat.workers.db.errors import ConflictError, NotFoundError
-from octasplat.workers.db.events_and_logs import add_event
+from octasplat.workers.db.events_and_logs import add_event, add_events
 from octasplat.workers.db.ids import new_id
 from octasplat.workers.db.locks import about_to_lock_jobs, lock_owner
 from octasplat.workers.db.postgres_text import as_json, as_json_or_null, storable_text
@@ -102,28 +102,50 @@ class RevisedOptions:
 async def create_job(connection: Connection, job_queue: JobQueue, new: NewJob) -> Job:
     """Write the job and its queue entry in one transaction."""
     async with connection.transaction():
-        job_id = new_id()
-        entry_id = await job_queue.enqueue(connection, NewEntry(job_id, new.queue, new.priority))
+        [job_id] = await create_jobs(connection, job_queue, [new])
+        return await _get_job_or_raise(connection, job_id)
+
+
+async def create_jobs(connection: Connection, job_queue: JobQueue, jobs: Sequence[NewJob]) -> list[uuid.UUID]:
+    """Write jobs and their queue entries in one transaction, in their order; return their ids."""
+    if not jobs:
+        return []
+    async with connection.transaction():
+        ids = [new_id() for _ in jobs]
+        entries = [NewEntry(job_id, new.queue, new.priority) for job_id, new in zip(ids, jobs, strict=True)]
+        entry_ids = await job_queue.enqueue_all(connection, entries)
+        rows = [
+            _row_of_job(job_id, new, entry_id)
+            for job_id, new, entry_id in zip(ids, jobs, entry_ids, strict=True)
+        ]
         await connection.execute(
             """
             INSERT INTO jobs (id, owner, kind, dataset_id, source_id, label, options, queue, priority, slip,
                               traceparent, estimate, files_id, requested, root_id, role, place)
-            VALUES (%s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s)
+            SELECT * FROM jsonb_to_recordset(%s) AS new (
+                id uuid, owner text, kind text, dataset_id uuid, source_id uuid, label text, options jsonb,
+                queue text, priority integer, slip bigint, traceparent text, estimate jsonb, files_id uuid,
+                requested jsonb, root_id uuid, role text, place bigint)
             """,
-            [
-                job_id, new.owner, new.kind, new.dataset_id, new.source_id, new.label,
-                as_json(dict(new.options)), new.queue, new.priority, entry_id, new.traceparent,
-                as_json_or_null(new.estimate), new.files_id, as_json_or_null(new.requested),
-                new.root_id, new.role, entry_id if new.place is None else new.place,
-            ],
-        )  # fmt: skip
+            [as_json(rows)],
+        )
         # What a new job uses is not about to expire any more.
-        for dataset_id in filter(None, (new.dataset_id, new.files_id)):
+        used = {used_id for new in jobs for used_id in (new.dataset_id, new.files_id) if used_id is not None}
+        for dataset_id in sorted(used):
             await connection.execute(
                 "UPDATE datasets SET used_at = now(), expires_at = NULL WHERE id = %s", [dataset_id]
             )
-        await add_event(connection, job_id, 0, "state", {"state": "queued"})
-        return await _get_job_or_raise(connection, job_id)
+        await add_events(connection, ids, 0, "state", {"state": "queued"})
+        return ids
+
+
+def _row_of_job(job_id: uuid.UUID, new: NewJob, entry_id: int) -> dict[str, Any]:
+    """Return a new job as JSON values by the names of its columns."""
+    row = {field.name: getattr(new, field.name) for field in fields(NewJob)}
+    texts = {name: str(value) for name, value in row.items() if isinstance(value, uuid.UUID)}
+    mappings = {name: dict(value) for name, value in row.items() if isinstance(value, Mapping)}
+    place = entry_id if new.place is None else new.place
+    return {**row, **texts, **mappings, "id": str(job_id), "slip": entry_id, "place": place}
 
 
 async def get_job(connection: Connection, job_id: uuid.UUID, *, lock: bool = False) -> Job | None:

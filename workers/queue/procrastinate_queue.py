@@ -51,17 +51,24 @@ class ProcrastinateQueue:
         """Queue an entry; see the protocol."""
         if entry.earlier_entry_id is not None:
             return await _reenqueue(connection, entry, entry.earlier_entry_id)
-        job = procrastinate.jobs.Job(
-            queue=entry.queue,
-            priority=entry.priority,
-            lock=None,
-            queueing_lock=None,
-            task_name=TASK_NAME,
-            task_kwargs={"job_id": str(entry.job_id)},
-        )
-        entry_id = (await self._manager.defer_job_async(job, connection=connection)).id
-        assert entry_id is not None
+        [entry_id] = await self.enqueue_all(connection, [entry])
         return entry_id
+
+    async def enqueue_all(self, connection: Connection, entries: Sequence[NewEntry]) -> list[int]:
+        """Queue entries of new jobs; see the protocol."""
+        jobs = [
+            procrastinate.jobs.Job(
+                queue=entry.queue,
+                priority=entry.priority,
+                lock=None,
+                queueing_lock=None,
+                task_name=TASK_NAME,
+                task_kwargs={"job_id": str(entry.job_id)},
+            )
+            for entry in entries
+        ]
+        deferred = await self._manager.batch_defer_jobs_async(jobs, connection=connection)
+        return [job.id for job in deferred if job.id is not None]
 
     async def remove(self, connection: Connection, entry_id: int) -> None:
         """Remove an entry; see the protocol."""

@@ -57,6 +57,10 @@ class JobQueue(Protocol):
         """
         ...
 
+    async def enqueue_all(self, connection: Connection, entries: Sequence[NewEntry]) -> list[int]:
+        """Queue entries of new jobs, last and in their order; returns their numbers."""
+        ...
+
     async def remove(self, connection: Connection, entry_id: int) -> None:
         """Remove an entry, whether it waits or its worker was lost; harmless if it is gone."""
         ...
