@@ -75,6 +75,14 @@ def test_run_begins_with_gaussians_and_exposures_of_a_finished_one(
     assert abs(gaussians(anew).means_world.mean() - before.means_world.mean()) > 1e-4
 
 
+def test_depth_maps_that_are_added_keep_the_exposures(scene: Path, finished: Path, tmp_path: Path) -> None:
+    measured = tmp_path / "measured"
+    shutil.copytree(scene, measured)
+    shutil.copytree(scene / "ground_truth" / "depth", measured / "depths")
+    run = reconstruct(measured, tmp_path / "run", make_config(**UNCHANGED), start_from=finished)
+    np.testing.assert_allclose(exposures(run), exposures(finished), atol=1e-6)
+
+
 def test_stopped_run_is_gone_on_with_by_other_settings_to_the_same_bytes(scene: Path, tmp_path: Path) -> None:
     stopped, stop = tmp_path / "stopped", [False]
 

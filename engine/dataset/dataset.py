@@ -361,6 +361,8 @@ class Dataset:
         """Release mapped pages to the system, e.g. before a stage that needs the memory."""
         for mapped in (self._cache.rgb, self._cache.alpha, self._cache.mask):
             mapped.release()
+        if self._depth_maps is not None:
+            self._depth_maps.values.release()
         self._view_rays.release_pages()
 
     def _view_size(self, view_index: int) -> tuple[int, int]:

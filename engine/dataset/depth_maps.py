@@ -1,8 +1,9 @@
 """Depth maps beside photographs: which file belongs to which, and how far away a ray's surface is.
 
 A depth map holds for each pixel how far its surface is from the camera along the axis of view (z), as depth
-cameras, phones and renderers write it. 0 and what is no finite number say that nothing is known. A map may be
-smaller than its photograph, and has the same ratio of sides and the same lens.
+cameras, phones and renderers write it. 0, what is no finite number, and the 1e10 that Blender writes where it
+meets nothing, say that nothing is known. A map may be smaller than its photograph, and has the same ratio of
+sides and the same lens.
 
     depths/<name>.png   16-bit: millimetres unless a scale is stated
     depths/<name>.exr   or .tif: floating point; metres unless a scale is stated
@@ -13,6 +14,7 @@ the sparse points: their depths in the model over those in the maps.
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -24,21 +26,25 @@ import OpenImageIO as oiio
 from jaxtyping import Float32, Float64, Int64
 
 from octasplat.engine.core.errors import DatasetError
-from octasplat.engine.core.scene_layout import IMAGE_SUFFIXES
+from octasplat.engine.core.relative_paths import normalize_name
+from octasplat.engine.core.scene_layout import DEPTH_FOLDERS, IMAGE_SUFFIXES
 from octasplat.engine.core.writing import atomic_replace, write_json
 from octasplat.engine.dataset.images import open_image, read_pixels
 from octasplat.engine.dataset.mapped_array import MappedArray
 from octasplat.engine.dataset.model import DatasetModel
 from octasplat.engine.dataset.pixel_cache import file_sha256
 
-CACHE_VERSION = 1
+CACHE_VERSION = 2
 """Raised whenever the contents of the cache file change for the same maps."""
 INTEGER_UNIT = 0.001
 """Metres for one unit of integers, as depth cameras store them."""
+MAX_STORED = 1e9
+"""From this value on nothing is known."""
 MIN_POINTS = 50
 """So many observations of sparse points decide the scale."""
 MAX_SPREAD = 0.1
 """Where half of the sparse points are farther off than this share, the maps do not belong to the model."""
+_INTEGERS = {oiio.UINT16: "uint16", oiio.INT16: "int16", oiio.UINT32: "uint32", oiio.INT32: "int32"}
 _VALUES, _INDEX = "depths.bin", "depths.json"
 
 
@@ -93,19 +99,29 @@ def find_depth_maps(
 
     Args:
         names: of the photographs.
-        on_disk: files of a folder of depth maps, by their paths below it.
+        on_disk: files of a folder of depth maps, by their paths below it, in Unicode form NFC.
         named: paths that a transforms file gives, by the names of the photographs.
     """
     by_name = {name.casefold(): path for name, path in on_disk.items()} | dict(on_disk)
     found = []
     for name in names:
-        stems = [PurePosixPath(name).with_suffix("").as_posix(), name]
+        photograph = PurePosixPath(normalize_name(name))
+        stems = [photograph.with_suffix("").as_posix(), photograph.as_posix()]
         candidates = [f"{stem}{suffix}" for stem in stems for suffix in sorted(IMAGE_SUFFIXES)]
         if name in named:
-            candidates = [PurePosixPath(named[name].replace("\\", "/")).name, *candidates]
+            candidates = [*_paths_below_folder(named[name]), *candidates]
         paths = (by_name.get(each) or by_name.get(each.casefold()) for each in candidates)
         found.append(next((path for path in paths if path is not None), None))
     return tuple(found)
+
+
+def _paths_below_folder(named: str) -> list[str]:
+    """Return what a path in a transforms file may be called below the folder of the maps, longest first."""
+    parts = PurePosixPath(normalize_name(named).replace("\\", "/")).parts
+    folders = [place for place, part in enumerate(parts[:-1]) if part in DEPTH_FOLDERS]
+    # below another folder, which may have been renamed, its name alone counts too
+    count = folders[-1] + 2 if folders else len(parts)
+    return ["/".join(parts[start:]) for start in range(count)]
 
 
 def read_depth_map(path: Path) -> tuple[Float32[np.ndarray, "h w"], bool]:
@@ -122,12 +138,14 @@ def read_depth_map(path: Path) -> tuple[Float32[np.ndarray, "h w"], bool]:
             f"{path} has 8 bits a pixel, which are too few for depths; store depths as 16-bit PNG "
             "(millimetres) or EXR (metres)."
         )
-    is_integer = kind in (oiio.UINT16, oiio.INT16, oiio.UINT32, oiio.INT32)
     names = [name.rsplit(".", 1)[-1].upper() for name in spec.channelnames]
     channel = names.index("Z") if "Z" in names else 0
-    pixels = read_pixels(source, path, "uint16" if kind in (oiio.UINT16, oiio.INT16) else "float")
+    # integers as they are stored, since a change of type stretches them over its range
+    stored = _INTEGERS.get(kind)
+    pixels = read_pixels(source, path, stored or "float")
     depth = np.ascontiguousarray(pixels[..., channel]).astype(np.float32)
-    return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0.0)), is_integer
+    known = (depth > 0) & (depth < MAX_STORED)
+    return np.where(known, depth, np.float32(0.0)), stored is not None
 
 
 def depth_maps_digest(model: DatasetModel) -> str | None:
@@ -156,13 +174,13 @@ def open_depth_maps(
         digest: of the maps, see :func:`depth_maps_digest`.
         unit_world: world units for one unit of the stored values; None takes millimetres for integers and
             metres for others.
-        threads: for decoding.
+        threads: for decoding; 0 takes one per processor.
 
     Raises:
         DatasetError: a map cannot be used.
         OutputError: the cache cannot be written.
     """
-    index = _read_index(folder, digest)
+    index = _read_index(folder, digest, [view.depth_path is not None for view in model.views])
     if index is None:
         index = _decode(model, folder, digest, threads)
     sizes = np.array(index["sizes_px"], np.int64)
@@ -238,7 +256,8 @@ class _Index(TypedDict):
     are_integers: list[bool]
 
 
-def _read_index(folder: Path, digest: str) -> _Index | None:
+def _read_index(folder: Path, digest: str, have_maps: Sequence[bool]) -> _Index | None:
+    """Return the index if it is of these maps and these views, of which some have none; else None."""
     try:
         index: _Index = json.loads((folder / _INDEX).read_text(encoding="utf-8"))
         count = sum(width * height for width, height in index["sizes_px"])
@@ -246,6 +265,8 @@ def _read_index(folder: Path, digest: str) -> _Index | None:
     except (OSError, ValueError, KeyError, TypeError):
         return None
     is_same = index.get("version") == CACHE_VERSION and index.get("digest") == digest
+    # the digest does not know of views without a map
+    is_same = is_same and [width > 0 for width, _ in index["sizes_px"]] == list(have_maps)
     return index if is_whole and is_same else None
 
 
@@ -255,7 +276,7 @@ def _decode(model: DatasetModel, folder: Path, digest: str, threads: int) -> _In
     sizes_px: list[list[int]] = []
     are_integers: list[bool] = []
     with (
-        ThreadPoolExecutor(max(1, threads)) as pool,
+        ThreadPoolExecutor(threads if threads > 0 else os.cpu_count() or 1) as pool,
         atomic_replace(folder / _VALUES) as path,
         path.open("wb") as file,
     ):

@@ -4,20 +4,27 @@ import os
 from pathlib import Path
 
 from octasplat.engine.core.relative_paths import normalize_name
-from octasplat.engine.core.scene_layout import is_ignored_file, is_photograph
+from octasplat.engine.core.scene_layout import IMAGES, is_ignored_file, is_photograph
 from octasplat.engine.dataset.results_among import is_run_folder
+
+_PHOTOGRAPH_FOLDERS = ("images", "input")
 
 
 def image_folder(root: Path) -> Path:
     """Return ``images/`` or ``input/`` of a scene, or the scene itself where neither holds photographs."""
-    folders = [root / name for name in ("images", "input") if (root / name).is_dir()]
+    folders = [root / name for name in _PHOTOGRAPH_FOLDERS if (root / name).is_dir()]
     elsewhere = root if not folders or _holds_photographs(root) else folders[0]
     return next((folder for folder in folders if _holds_photographs(folder)), elsewhere)
 
 
 def _holds_photographs(folder: Path) -> bool:
     names = (path.relative_to(folder).as_posix() for path in folder.rglob("*"))
-    return any(is_photograph(name) and not is_ignored_file(name) for name in names)
+    return any(is_photograph(_within(folder) + name) and not is_ignored_file(name) for name in names)
+
+
+def _within(folder: Path) -> str:
+    """Return what names of files in ``folder`` begin with in a scene: images/depth/ holds no depth maps."""
+    return IMAGES if folder.name in _PHOTOGRAPH_FOLDERS else ""
 
 
 def files_below(folder: Path) -> dict[str, Path]:
@@ -37,4 +44,5 @@ def files_below(folder: Path) -> dict[str, Path]:
 
 def photographs_below(folder: Path) -> dict[str, Path]:
     """Return photographs by their NFC-normalised path below ``folder``, of the formats that are taken."""
-    return {name: path for name, path in files_below(folder).items() if is_photograph(name)}
+    top = _within(folder)
+    return {name: path for name, path in files_below(folder).items() if is_photograph(top + name)}

@@ -18,6 +18,7 @@ from pathlib import Path
 import platformdirs
 
 from octasplat.engine.core.errors import ConfigError, OutputError
+from octasplat.engine.core.scene_layout import SCENE_FOLDERS
 from octasplat.engine.dataset.results_among import is_run_folder
 
 RECORD_VARIABLE = "OCTASPLAT_WRITTEN"
@@ -34,7 +35,7 @@ _KINDS = {**dict.fromkeys(_SCENES, "scene"), "render": "pictures", "relight": "p
 _FOR_EDITS = "stage-init"
 """The verb whose output is there to be written on by hand; it is not replaced even if nobody has yet."""
 _UNCHANGED_SINCE = dict[str, tuple[int, int]]
-_DATASET_FOLDERS = ("images", "masks", "sparse", "colmap")
+_DATASET_FOLDERS = ("input", *SCENE_FOLDERS)
 _RUN_FILES = (
     "config.json", "events.jsonl", "held_out.json", "views.json", "training.json", "plan.json", "scene.ply",
     "edits.json", "environment.hdr", "environment.exr", "background.exr", "georeference.json",

@@ -165,7 +165,7 @@ def started_state(
     gaussians = _with_channels_for(config, gaussians, progress)
     state = initial_train_state(dataset, config, threads=threads, gaussians=gaussians)
     before = _views_of_start(output)
-    if before is None or before.difference(dataset.views_record.about(before.origin_world)) is not None:
+    if before is None or before.difference(_as_before(dataset.views_record, before)) is not None:
         return state
     fresh = make_shading(ShadingOptions.from_config(config), len(dataset.views), dataset.extent).state()
     if _shapes(fresh) == _shapes(kept.shading):
@@ -179,6 +179,12 @@ def started_state(
     elif np.any(kept.pose_corrections):
         progress(Noted("The other run refined its poses, and this one trains with those of the model."))
     return state
+
+
+def _as_before(views: ViewsRecord, before: ViewsRecord) -> ViewsRecord:
+    """Return views about another record's origin; depth maps tell nothing of exposures or light."""
+    moved = views.about(before.origin_world)
+    return moved.model_copy(update={"depths_sha256": before.depths_sha256})
 
 
 def _read_source(source: Path) -> tuple[BestState, Origin]:

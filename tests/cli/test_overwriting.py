@@ -121,6 +121,14 @@ def test_foreign_files_among_frames_are_kept(here, octasplat, monkeypatch):
     assert contents(here / "other.mp4.frames") == {"000001.png": NOT_OURS}
 
 
+@pytest.mark.parametrize("folder", ["depths", "depth", "input"])
+def test_every_folder_of_a_scene_is_kept(here, octasplat, monkeypatch, folder):
+    monkeypatch.chdir(here)
+    (here / "photographs" / folder).mkdir()
+    refused = octasplat("render", "run", *ONE_IMAGE, "-o", f"photographs/{folder}/new")
+    assert refused.exit_code == 1 and "would overwrite what the command reads" in refused.stderr, refused
+
+
 def test_output_of_other_kind_is_kept(here, octasplat, monkeypatch):
     monkeypatch.chdir(here)
     assert octasplat("crop", "scene.ply", "--where", "opacity > 0", "-o", "x.ply").exit_code == 0

@@ -2,7 +2,9 @@
 
 import json
 import shutil
+import unicodedata
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +13,17 @@ import pytest
 
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.scene_layout import lay_out_scene
-from octasplat.engine.dataset import Dataset
+from octasplat.engine.dataset import Dataset, load_dataset_model
+from octasplat.engine.dataset.depth_maps import (
+    depth_maps_digest,
+    find_depth_maps,
+    open_depth_maps,
+    read_depth_map,
+)
+from octasplat.engine.dataset.photograph_files import image_folder, photographs_below
 from tests.support.tiny_dataset import make_tiny_dataset
 
-_FORMATS = {"float32": "float", "uint16": "uint16", "uint8": "uint8"}
+_FORMATS = {"float32": "float", "uint16": "uint16", "int16": "int16", "uint8": "uint8"}
 
 
 @pytest.fixture(scope="module")
@@ -200,3 +209,59 @@ def test_a_scene_keeps_its_depth_maps_apart_from_photographs() -> None:
     assert lay_out_scene(names).files == {name.removeprefix("s/"): name for name in names}
     bare = lay_out_scene(["a.jpg", "b.jpg", "depth/a.png"])
     assert bare.files == {"images/a.jpg": "a.jpg", "images/b.jpg": "b.jpg", "depth/a.png": "depth/a.png"}
+
+
+def test_cached_maps_are_those_of_the_views(with_maps: Callable[..., Path], tmp_path: Path) -> None:
+    scene = with_maps()
+    min((scene / "depths").iterdir()).unlink()
+    model = load_dataset_model(scene)
+    fewer = replace(model, views=model.views[1:])  # without the photograph that has no map
+    digest = depth_maps_digest(model)
+    assert digest is not None and digest == depth_maps_digest(fewer)
+    open_depth_maps(model, tmp_path / "cache", digest)
+    found = open_depth_maps(fewer, tmp_path / "cache", digest)
+    fresh = open_depth_maps(fewer, tmp_path / "fresh", digest)
+    np.testing.assert_array_equal(found.sizes_px, fresh.sizes_px)
+    np.testing.assert_array_equal(found.offsets, fresh.offsets)
+
+
+@pytest.mark.parametrize("kind", [np.uint16, np.int16])
+def test_integers_are_read_as_they_are_stored(tmp_path: Path, kind: type[np.integer]) -> None:
+    write_map(tmp_path / "a.tif", np.array([[0, 1500, 30000]], kind))
+    depth, is_integer = read_depth_map(tmp_path / "a.tif")
+    assert is_integer
+    np.testing.assert_array_equal(depth, [[0, 1500, 30000]])
+
+
+def test_what_a_renderer_writes_for_nothing_is_unknown(tmp_path: Path) -> None:
+    write_map(tmp_path / "a.exr", np.array([[1e10, np.inf, np.nan, -1, 0, 2.5]], np.float32))
+    np.testing.assert_array_equal(read_depth_map(tmp_path / "a.exr")[0], [[0, 0, 0, 0, 0, 2.5]])
+
+
+def test_maps_belong_to_the_photographs_that_name_them() -> None:
+    on_disk = {name: Path(name) for name in ("1.png", "left/1.png", "right/1.png", "right/d2.png")}
+    named = {
+        "left/1.jpg": "./depths/left/1.png", "right/1.jpg": "C:\\s\\depth\\right\\1.png",
+        "2.jpg": "maps/right/d2.png", "3.jpg": "maps/1.png", "4.jpg": "depths/gone/1.png",
+    }  # fmt: skip
+    found = find_depth_maps(list(named), on_disk, named)
+    assert [None if path is None else path.as_posix() for path in found] == [
+        "left/1.png", "right/1.png", "right/d2.png", "1.png", None,
+    ]  # fmt: skip
+
+
+def test_names_are_compared_in_one_unicode_form() -> None:
+    composed, apart = (unicodedata.normalize(form, "Höhe") for form in ("NFC", "NFD"))
+    path = Path(f"{composed}.png")
+    assert find_depth_maps([f"{apart}.jpg"], {path.name: path}, {}) == (path,)
+    assert find_depth_maps(["a.jpg"], {path.name: path}, {"a.jpg": f"depths/{apart}.png"}) == (path,)
+
+
+def test_photographs_below_images_are_no_depth_maps(generated: Path, tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    for photograph in (generated / "images").iterdir():
+        (scene / "images" / "depth").mkdir(parents=True, exist_ok=True)
+        shutil.copy(photograph, scene / "images" / "depth" / photograph.name)
+    names = {path.relative_to(scene).as_posix() for path in scene.rglob("*.*")}
+    assert set(lay_out_scene(sorted(names)).files) == names
+    assert {f"images/{name}" for name in photographs_below(image_folder(scene))} == names

@@ -34,7 +34,7 @@ export function chosenFiles(input) {
 }
 
 /** Folders of one scene; whoever drops these beside each other means one. */
-const PARTS_OF_A_SCENE = new Set(["images", "masks", "sparse", "colmap", "depth", "normal"]);
+const PARTS_OF_A_SCENE = new Set(["images", "input", "masks", "sparse", "colmap", "distorted", "depths", "depth", "normal"]);
 
 /** The scenes of what was chosen: one each for several archives or folders beside each other, else a single one. */
 export async function scenesOf(found) {
