@@ -199,11 +199,21 @@ class Run:
             found.append(linear_to_srgb(np.clip(mean, 0, 1)) * alpha)
         return found
 
-    def normal_errors(self, view: View) -> Float64[np.ndarray, " p"]:
-        """Return the angles between the mean normals of the run and the true ones, degrees."""
-        normal = sum(self.tracer.trace(s.rays).normal_world.astype(np.float64) for s in view.samples)
+    def surface_errors(self, view: View) -> dict[str, Float64[np.ndarray, " p"]]:
+        """Return how far the mean normals and materials of pixels are from the true ones, by name."""
+        results = [self.tracer.trace(sample.rays) for sample in view.samples]
+        normal = sum(result.normal_world.astype(np.float64) for result in results)
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-        return normal_angles_degrees(normal, view.normals)
+        weight = np.maximum(sum(result.alpha.astype(np.float64) for result in results), 1e-6)
+        material = sum(result.features[:, :5].astype(np.float64) for result in results) / weight[:, None]
+        true = sum(sample.values[:, 3:] for sample in view.samples) / len(view.samples)
+        off = np.abs(material - true)
+        return {
+            "normals, degrees": normal_angles_degrees(normal, view.normals),
+            "albedo, % off": 100 * off[:, :3].mean(axis=1),
+            "metallic, % off": 100 * off[:, 3],
+            "roughness, % off": 100 * off[:, 4],
+        }
 
 
 def turned_to(gaussians: FlatGaussians, normals: Float64[np.ndarray, "n 3"]) -> np.ndarray:
@@ -305,7 +315,7 @@ def table(rows: Mapping[str, list[float]], heads: Iterable[str]) -> str:
     lines = ["| | " + " | ".join(heads) + " |"]
     lines.append("|" + "---|" * (lines[0].count("|") - 1))
     lines += [
-        f"| {name} | " + " | ".join(f"{value:.1f}" for value in values) + " |"
+        f"| {name} | " + " | ".join("-" if np.isnan(value) else f"{value:.1f}" for value in values) + " |"
         for name, values in rows.items()
     ]
     return "\n".join(lines)
@@ -346,16 +356,15 @@ def main() -> None:
     region = np.concatenate([view.region for view in views])
     shown = run.pictures(frozenset(), views)
     squared = [((a - view.wanted) ** 2).sum(axis=1) for a, view in zip(shown, views, strict=True)]
-    errors, angles = np.concatenate(squared), np.concatenate([run.normal_errors(view) for view in views])
+    errors, off = np.concatenate(squared), [run.surface_errors(view) for view in views]
+    parts = [region == k for k in range(len(REGIONS))]
     shares = {
-        "share of the pixels, %": [100 * float((region == k).sum() / (region >= 0).sum()) for k in range(6)],
-        "share of the squared error, %": [
-            100 * float(errors[region == k].sum() / errors.sum()) for k in range(6)
-        ],
-        "normals, degrees": [
-            float(angles[region == k].mean()) if (region == k).any() else np.nan for k in range(6)
-        ],
+        "share of the pixels, %": [100 * float(part.sum() / (region >= 0).sum()) for part in parts],
+        "share of the squared error, %": [100 * float(errors[part].sum() / errors.sum()) for part in parts],
     }
+    for name in off[0]:
+        values = np.concatenate([found[name] for found in off])
+        shares[name] = [float(values[part].mean()) if part.any() else np.nan for part in parts]
     print(table(shares, REGIONS), flush=True)
     rows = {"the run": row_of(shown, views)}
     if not given.brief:

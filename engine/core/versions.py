@@ -22,7 +22,7 @@ PACKAGES = (
 )
 
 
-RESULTS_VERSION = 3
+RESULTS_VERSION = 4
 """Raised whenever the same settings give other results than before: what was begun under one number is begun
 anew under another, rather than gone on with."""
 

@@ -132,10 +132,11 @@ def test_truths_put_into_a_run_bring_it_nearer_to_the_pictures(
 def read_table(text: str) -> dict[str, list[float]]:
     """Return the rows of numbers of a table in Markdown."""
     rows = [[cell.strip() for cell in line.strip("| ").split("|")] for line in text.splitlines()]
+    numbers = {row[0]: ["nan" if cell == "-" else cell for cell in row[1:]] for row in rows}
     return {
-        row[0]: [float(cell) for cell in row[1:]]
-        for row in rows
-        if row[-1][-1:].isdigit() or row[-1] == "nan"
+        name: [float(cell) for cell in row]
+        for name, row in numbers.items()
+        if row and (row[-1] == "nan" or row[-1][-1:].isdigit())
     }
 
 

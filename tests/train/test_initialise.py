@@ -1,10 +1,21 @@
 """The first Gaussians."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from octasplat.engine.core.errors import DatasetError
-from octasplat.engine.train.initialization.initial_gaussians import gaussians_from_points, gaussians_from_rays
+from octasplat.engine.dataset import Dataset
+from octasplat.engine.dataset.synthetic.still_life import build_still_life
+from octasplat.engine.train.config import preset, with_materials
+from octasplat.engine.train.initialization.initial_gaussians import (
+    gaussians_from_points,
+    gaussians_from_rays,
+    initial_train_state,
+)
+from tests.support.tiny_dataset import make_tiny_dataset
 
 CAMERAS = np.array([[0.0, 0.0, -3.0], [1.0, 0.0, -3.0], [0.0, 1.0, -3.0]])
 
@@ -100,3 +111,39 @@ def test_random_ones_lie_on_their_rays_and_face_the_camera(count: int) -> None:
     assert np.abs((first.rotations[:, :, 0] * directions).sum(axis=1)).min() > 1 - 1e-5
     assert first.is_finite() and (first.scales > 0).all()
     np.testing.assert_allclose(first.base_rgb_srgb, 0.25, atol=1e-6)
+
+
+def test_normals_face_the_views_that_observe_the_points() -> None:
+    thin_plate = np.concatenate([grid(), grid() + np.array([0, 0, 0.2])])
+    seen_from = np.repeat([[0.6, 0.0, -0.8], [0.0, 0.6, 0.8]], 144, axis=0)
+    normals = start(thin_plate, seen_from=seen_from).rotations[:, :, 0]
+    np.testing.assert_allclose(normals, np.repeat([[0, 0, -1.0], [0, 0, 1.0]], 144, axis=0), atol=1e-5)
+
+
+def test_normals_of_points_along_a_wire_stand_across_it() -> None:
+    rng = np.random.default_rng(1)
+    around = np.arange(80) * 2.4
+    ring = np.stack([np.cos(around), np.sin(around), np.zeros(80)], axis=-1)
+    wire = 0.01 * ring + np.arange(80)[:, None] * [0, 0, 0.03]
+    seen_from = ring + np.array([0.0, 0.0, 0.5])  # each point from its own side, and from above
+    seen_from /= np.linalg.norm(seen_from, axis=1, keepdims=True)
+    first = start(wire + rng.normal(0, 1e-4, wire.shape), seen_from=seen_from)
+    outwards = (first.rotations[:, :, 0] * ring).sum(axis=1)
+    assert outwards.min() > 0.8 and np.median(outwards) > 0.98
+
+
+def test_points_without_observations_face_the_cameras() -> None:
+    normals = start(grid(), seen_from=np.zeros((144, 3))).rotations[:, :, 0]
+    np.testing.assert_allclose(normals, [[0, 0, -1.0]] * 144, atol=1e-5)
+
+
+def test_materials_begin_with_normals_that_point_out_of_the_things(
+    tmp_path_factory: pytest.TempPathFactory, tmp_path: Path
+) -> None:
+    scene = make_tiny_dataset(tmp_path_factory, views=16, points=1200)
+    dataset = Dataset.open(scene, tmp_path / "cache")
+    first = initial_train_state(dataset, with_materials(preset("fast"))).gaussians
+    life = build_still_life()
+    nearest = cKDTree(life.vertices).query(first.means_world)[1]
+    cosines = (first.rotations[:, :, 0] * life.vertex_normals[nearest]).sum(axis=1)
+    assert (cosines > 0).mean() > 0.97

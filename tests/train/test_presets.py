@@ -14,7 +14,7 @@ from octasplat.engine.pipeline import reconstruct
 from octasplat.engine.runs.config import resolve_config
 from octasplat.engine.shading.plain import PLAIN_SHADING
 from octasplat.engine.trace.cpu.tracer import CpuTracer
-from octasplat.engine.train.config import LossWeights, TrainConfig, preset
+from octasplat.engine.train.config import LossWeights, McmcConfig, TrainConfig, preset, with_materials
 from octasplat.engine.train.densify import make_densifier
 from octasplat.engine.train.loop.iteration import TrainComponents, loss_and_gradients, train_step
 from octasplat.engine.train.loop.state import initial_state
@@ -205,3 +205,12 @@ def test_real_scene_reaches_reference_psnr(scenes_root: Path, tmp_path: Path) ->
 def test_trace_order_is_not_a_setting() -> None:
     with pytest.raises(ConfigError, match=r"trace\.sort.*shared_sort_until"):
         resolve_config("fast", assignments=["trace.sort=packet"])
+
+
+def test_short_trainings_with_materials_take_larger_steps_of_all_but_rotations() -> None:
+    short, long = with_materials(preset("fast")), with_materials(preset("standard"))
+    for name in ("mean", "log_scale", "albedo", "metallic", "roughness"):
+        assert getattr(short.lr, name) > getattr(long.lr, name)
+    assert short.lr.quat == long.lr.quat and short.lr.mean < preset("fast").lr.mean
+    assert isinstance(short.densify, McmcConfig) and isinstance(long.densify, McmcConfig)
+    assert short.densify.growth > long.densify.growth and short.densify.copies == long.densify.copies

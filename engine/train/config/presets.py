@@ -11,14 +11,19 @@ from octasplat.engine.train.config.train import TrainConfig
 
 FLIP_NORMAL_COS = 0.5
 """Cosine beyond which normals that point away are turned, where materials are learnt."""
+SHORT_TRAINING = 5000
+"""Iterations of a preset without materials up to which those with them take larger steps and grow sooner."""
+SHORT_MATERIAL_RATES = {"mean": 0.05, "log_scale": 0.04, "albedo": 0.08, "metallic": 0.05, "roughness": 0.05}
 
 
 def with_materials(config: TrainConfig) -> TrainConfig:
     """Return a configuration for reflective scenes: materials are learnt, and geometry moves in small steps.
 
     Reflections ask for normals to within a degree, so steps are small. Points lifted from photographs that
-    show reflections lie behind the surface, so there are none.
+    show reflections lie behind the surface, so there are none. In a short training small steps do not get to
+    where thin parts and textures are: all but those of the rotations are larger there.
     """
+    is_short = 0 < config.iterations <= SHORT_TRAINING
     rates = {
         "quat": 1e-3,
         "mean": 0.016,
@@ -27,7 +32,11 @@ def with_materials(config: TrainConfig) -> TrainConfig:
         "opacity": 0.1,
         "sh_rest_ratio": 0.05,
         "scale_after": 0,
+        **(SHORT_MATERIAL_RATES if is_short else {}),
     }
+    densify = McmcConfig(copies="area", stop_fraction=0.4, relocate_low_weight_below=0.0)
+    if is_short:
+        densify = densify.model_copy(update={"growth": 0.4, "stop_fraction": 0.5})
     return config.model_copy(
         update={
             # Rays may begin so near to a surface as they pass it, which normals with a side allow.
@@ -51,7 +60,7 @@ def with_materials(config: TrainConfig) -> TrainConfig:
             "camera_clearance": 0.0,
             "shared_sort_until": 0.0,
             "early_stopping_db": 0.0,
-            "densify": McmcConfig(copies="area", stop_fraction=0.4, relocate_low_weight_below=0.0),
+            "densify": densify,
             "initial_opacity": 0.8,
             "trace": config.trace.model_copy(update={"flip_normal_cos": FLIP_NORMAL_COS}),
             "max_gaussians_auto": min(config.max_gaussians_auto * 4 // 5, 80_000),

@@ -20,6 +20,11 @@ from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.shading.recipes import material_shading
 from octasplat.engine.train.config import TrainConfig, max_gaussian_count
 from octasplat.engine.train.initialization.initial_background import InitialBackground, estimate_background
+from octasplat.engine.train.initialization.initial_normals import (
+    mean_view_directions,
+    plane_normals,
+    seen_normals,
+)
 from octasplat.engine.train.initialization.plane_sweep import plane_sweep_points
 from octasplat.engine.train.initialization.plane_sweep_points import PlaneSweepPoints
 from octasplat.engine.train.loop.state import TrainState, initial_state
@@ -50,6 +55,7 @@ class InitialGaussianOptions:
         plane_sweep: whether pixels are lifted to their depth where there are fewer sparse points.
         plane_sweep_unseen: whether pixels that no neighbouring view shows are lifted, too.
         equalizes_exposure: whether colors of lifted pixels are compared at equal brightness of the views.
+        faces_views: whether normals face the views that observe the points, for shading by one side of them.
     """
 
     seed: int
@@ -59,6 +65,7 @@ class InitialGaussianOptions:
     plane_sweep: bool
     plane_sweep_unseen: bool
     equalizes_exposure: bool
+    faces_views: bool = False
 
     @classmethod
     def from_config(cls, config: TrainConfig, dataset: Dataset) -> "InitialGaussianOptions":
@@ -72,6 +79,7 @@ class InitialGaussianOptions:
             plane_sweep=config.plane_sweep_init,
             plane_sweep_unseen=config.plane_sweep_unseen,
             equalizes_exposure=config.exposure is True,
+            faces_views=config.materials.learn,
         )
 
 
@@ -124,6 +132,7 @@ def initial_gaussians(
             plane_points=options.normal_neighbors,
             most_angles=max_angles,
             region=dataset.region,
+            seen_from=_seen_from(dataset, len(xyz)) if options.faces_views else None,
         )
     # --- too few sparse points: random pixels at random depths ---
     view, y, x = dataset.sample_pixels(rng, limit)
@@ -153,6 +162,12 @@ def lift_known_pixels(dataset: Dataset, count: int, rng: np.random.Generator) ->
     rays = dataset.rays(view[known], y[known], x[known])
     xyz = rays.origins_world + distance[known, None] * rays.directions_world
     return PlaneSweepPoints(xyz.astype(np.float32), rgb[known], np.zeros(len(xyz), np.bool_))
+
+
+def _seen_from(dataset: Dataset, count: int) -> Float64[np.ndarray, "n 3"]:
+    """Return directions to the views of ``count`` points, of which the sparse ones are first; 0 of others."""
+    known = mean_view_directions(dataset)
+    return np.pad(known, ((0, count - len(known)), (0, 0)))
 
 
 def add_initial_materials(gaussians: FlatGaussians, settings: MaterialSettings) -> FlatGaussians:
@@ -204,13 +219,15 @@ def gaussians_from_points(
     plane_points: int = 8,
     most_angles: Float64[np.ndarray, " n"] | None = None,
     region: Region | None = None,
+    seen_from: Float64[np.ndarray, "n 3"] | None = None,
 ) -> FlatGaussians:
     """Return flat Gaussians on sparse points.
 
     The scales are the mean distance to the three nearest points; the normal is that of the plane through
     the ``plane_points`` nearest where they lie on one, else it looks at the cameras. More than ``limit``
     points are thinned at random. ``most_angles`` are the largest scales as seen from the nearest camera,
-    radians; None for ``MAX_ANGULAR_SIZE``. Points of a region are kept before others.
+    radians; None for ``MAX_ANGULAR_SIZE``. Points of a region are kept before others. Where mean directions
+    to the views that observe the points are given in ``seen_from``, normals face these.
     """
     centre = np.median(camera_centres_world, axis=0)
     far = np.linalg.norm(xyz_world - centre, axis=1) > MAX_DISTANCE * extent
@@ -246,12 +263,10 @@ def gaussians_from_points(
     spacing = np.minimum(spacing, np.maximum(max_angles * to_camera, 1e-5 * extent))
     normals = _normalize_or_z_axis(centre - points)  # facing the cameras, where no plane is found
     if neighbor_count == plane_points + 1:
-        neighborhoods = points[neighbours]
-        neighborhoods = neighborhoods - neighborhoods.mean(axis=1, keepdims=True)
-        values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", neighborhoods, neighborhoods))
-        # the least spread is small against the next: the points lie on a plane
-        planar = values[:, 0] < 0.1 * values[:, 1]
-        normals[planar] = vectors[planar, :, 0]
+        if seen_from is None:
+            normals = plane_normals(points[neighbours], normals)
+        else:
+            normals = seen_normals(points[neighbours], seen_from[keep], normals)
     return _assemble(points, normals, spacing, rgb_srgb[keep], opacity)
 
 
