@@ -30,6 +30,8 @@ class Settings(BaseModel):
 
     former_settings: ClassVar[Mapping[str, FormerSetting]] = {}
     former_names: ClassVar[FormerNames] = NONE
+    later_settings: ClassVar[frozenset[str]] = frozenset()
+    """Settings that earlier versions did not have; left out of digests where they are None."""
 
     @model_validator(mode="before")
     @classmethod
@@ -70,6 +72,8 @@ def dump_with_former_settings(settings: Settings) -> dict[str, Any]:
     names = former_names(type(settings))
     former_name = {new: old for old, new in names.fields.items()}
     for name, value in settings.model_dump(mode="json").items():
+        if value is None and name in settings.later_settings:
+            continue
         inner = getattr(settings, name)
         former_value = {new: old for old, new in names.values.get(name, {}).items()}
         if isinstance(inner, Settings):

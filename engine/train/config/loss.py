@@ -24,6 +24,7 @@ class LossWeights(Settings):
     """
 
     former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.LOSS
+    later_settings: ClassVar[frozenset[str]] = frozenset({"depth"})
 
     l1: Annotated[float, Unit("weight"), ADVANCED] = Field(
         0.8,

@@ -39,10 +39,7 @@ _DAMAGE = (
 def run_fingerprint(dataset: Dataset, config: TrainConfig) -> str:
     """Return a digest of the settings and the photographs that decide every byte of a training."""
     # settings under their former names, so that older checkpoints keep their digest
-    settings = dump_with_former_settings(config)
-    if config.loss.depth is None:  # as before there were depth maps
-        del settings["loss"]["depth"]
-    parts: list[object] = [settings, dataset.views_record.fingerprint()]
+    parts: list[object] = [dump_with_former_settings(config), dataset.views_record.fingerprint()]
     if dataset.region is not None:
         parts.append(dataset.region.corners_world)
     text = json.dumps(parts)
