@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 
 from octasplat.engine.core.errors import CancelledError
@@ -16,6 +17,7 @@ from octasplat.engine.runs.config import ReconstructionConfig, resolve_config
 from octasplat.engine.shading.plain import PLAIN_SHADING
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.train.config import LossWeights, TrainConfig, uses_shared_sort, with_depth_weight
+from octasplat.engine.train.initialization.initial_gaussians import initial_train_state
 from octasplat.engine.train.loop.iteration import loss_and_gradients
 from octasplat.engine.train.optimization.depth_loss import ROUNDING, depth_differences
 from octasplat.engine.train.sampling.batches import Batch
@@ -118,6 +120,29 @@ def test_maps_make_the_geometry_right(plain_scene: Path, measured_scene: Path, t
     errors = [depth_error(measured_scene, run, tmp_path / "cache") for run in (plain, measured)]
     assert errors[1] < 0.5 * errors[0]
     assert errors[1] < 0.03
+
+
+def without_points(model: Path) -> None:
+    reconstruction = pycolmap.Reconstruction(str(model))
+    for number in list(reconstruction.points3D):
+        reconstruction.delete_point3D(number)
+    reconstruction.write_binary(str(model))
+
+
+def test_few_maps_and_no_sparse_points_begin_a_training(measured_scene: Path, tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    shutil.copytree(measured_scene, scene)
+    for path in sorted((scene / "depths").iterdir())[3:]:
+        path.unlink()
+    config = TrainConfig(initial_points=400, max_gaussians=400)
+    dataset = Dataset.open(scene, tmp_path / "cache", test_every=4)
+    # pixels of photographs without a map are lifted by a plane sweep
+    swept = len(initial_train_state(dataset, config).gaussians)
+    without_points(scene / "sparse" / "0")
+    bare = Dataset.open(scene, tmp_path / "cache", test_every=4)
+    assert len(bare.points) == 0
+    lifted = len(initial_train_state(bare, config).gaussians)
+    assert 50 < lifted < swept - 200 and swept <= 400
 
 
 def test_stopped_training_with_maps_goes_on_to_the_same_bytes(measured_scene: Path, tmp_path: Path) -> None:

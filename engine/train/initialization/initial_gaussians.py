@@ -103,15 +103,16 @@ def initial_gaussians(
     """
     # a stream of its own: 0 is the training's, 1 the probe's
     rng = np.random.Generator(np.random.PCG64([options.seed, 2]))
-    limit, has_depths = options.max_count, dataset.has_known_distances
+    limit = options.max_count
     xyz, rgb = dataset.points.xyz_world, dataset.points.rgb_srgb
-    if has_depths and len(xyz) < limit:
+    if dataset.has_known_distances and len(xyz) < limit:
         lifted = lift_known_pixels(dataset, limit - len(xyz), rng)
         xyz, rgb = np.concatenate([xyz, lifted.xyz_world]), np.concatenate([rgb, lifted.rgb_srgb])
     if len(xyz) >= MIN_POINTS:
         centres = np.stack([dataset.views[i].origin_world for i in dataset.train_indices])
         max_angles = np.full(len(xyz), MAX_ANGULAR_SIZE)
-        if options.plane_sweep and not has_depths and len(xyz) < limit:
+        # a sweep begins at the depths of sparse points
+        if options.plane_sweep and len(dataset.points) >= MIN_POINTS and len(xyz) < limit:
             gains = equalizing_gains(dataset) if options.equalizes_exposure else None
             more = plane_sweep_points(
                 dataset, limit - len(xyz), rng,
