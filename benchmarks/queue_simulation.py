@@ -65,11 +65,8 @@ _FAULTS: dict[str, LiteralString] = {
         SELECT count(*) FROM jobs WHERE NOT EXISTS (
             SELECT FROM job_events WHERE job_id = jobs.id AND kind = 'state' AND data->>'state' = 'succeeded')
         """,
-    # Queued once when it was accepted, once by its blocks, and once for each attempt that was lost.
     "wholes that were not released once": """
-        SELECT count(*) FROM jobs AS root WHERE role = 'root' AND (
-            SELECT count(*) FILTER (WHERE kind = 'state' AND data->>'state' = 'queued')
-                - count(*) FILTER (WHERE kind = 'rescued') FROM job_events WHERE job_id = root.id) <> 2
+        SELECT count(*) FROM jobs WHERE role = 'root' AND cardinality(continuations) <> 1
         """,
     "wholes whose blocks were not all told of": """
         SELECT count(*) FROM jobs AS root WHERE role = 'root' AND (
