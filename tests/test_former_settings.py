@@ -48,7 +48,7 @@ def test_config_with_another_value_of_a_former_setting_is_refused(
     ("name", "materials", "digest"),
     [
         ("standard", False, "a34d565b9a2e82f2e9dfada8b3fcc0bf718e4f0a4afc6d9f38390e1d877aa1ed"),
-        ("fast", True, "2b66c3145d6a01435831ba8d7671c336e6e2fc3c34a7b11cbada04bd5fdaeba5"),
+        ("standard", True, "f384173e5f95ef1176ab0b03daa39c4f466a66414a83113e0f32ce603158aeac"),
     ],
 )
 def test_settings_digest_equals_former_version(name: str, materials: bool, digest: str) -> None:
