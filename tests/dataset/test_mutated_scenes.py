@@ -50,8 +50,11 @@ def renamed(suffix: str) -> Mutation:
 def saved_as(suffix: str, mode: str) -> Mutation:
     def mutate(scene: Path, number: int) -> None:
         path = photograph(scene, number)
-        with Image.open(path) as image:
-            picture = image.convert(mode)
+        try:
+            with Image.open(path) as image:
+                picture = image.convert(mode)
+        except OSError:  # an earlier mutation cut it
+            return
         path.unlink()
         picture.save(path.with_suffix(suffix))
 
