@@ -44,11 +44,10 @@ def plan_from_points(
     Raises:
         ConfigError: there are too few points that were observed.
     """
-    is_trained = np.isin(model.observations.view, train_indices)
-    view, point_ids = model.observations.view[is_trained], model.observations.point[is_trained]
-    xy_px = model.observations.xy_px[is_trained]
-    # ids ascend
-    rows = np.minimum(np.searchsorted(model.points.ids, point_ids), max(len(model.points) - 1, 0))
+    rows, is_there = model.points.rows_of(model.observations.point)
+    counted = np.isin(model.observations.view, train_indices) & is_there
+    rows, view = rows[counted], model.observations.view[counted]
+    xy_px = model.observations.xy_px[counted]
     if len(model.points) == 0 or len(rows) == 0:
         raise ConfigError(
             f"The model in {model.model_folder} has no points that photographs show, by which blocks are "

@@ -19,6 +19,8 @@ from dataclasses import dataclass
 from enum import Enum
 from pathlib import PurePosixPath
 
+from octasplat.engine.core.name_lists import name_list
+
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".exr", ".hdr"})
 """Photographs that are taken at every door."""
 UNREAD_SUFFIXES = frozenset(
@@ -55,7 +57,6 @@ _GENERATED_FILE = re.compile(
     r"(.*/)?(generated\.json|ground_truth/(mesh\.ply|(depth|normals)/[^/]+\.exr|masks/[^/]+\.png))"
 )
 """What a generated scene has beside its photographs, and nobody misses among them."""
-_SHOWN_NAMES = 3
 
 
 class FileRole(Enum):
@@ -225,7 +226,7 @@ def left_out_sentences(paths: Sequence[str]) -> tuple[str, ...]:
         kind = "results" if path.startswith(results) else _kind_of(path)
         kinds.setdefault(kind, []).append(path)
     return tuple(
-        sentence.format(count=len(kinds[kind]), names=_name_list(kinds[kind]))
+        sentence.format(count=len(kinds[kind]), names=name_list(kinds[kind]))
         for kind, sentence in _SENTENCES.items()
         if kind in kinds
     )
@@ -262,8 +263,3 @@ def _kind_of(path: str) -> str:
 
 def _is_picture(name: str) -> bool:
     return PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES
-
-
-def _name_list(names: Sequence[str]) -> str:
-    shown = ", ".join(name if name.isprintable() else ascii(name) for name in names[:_SHOWN_NAMES])
-    return shown + (", ..." if len(names) > _SHOWN_NAMES else "")

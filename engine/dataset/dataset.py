@@ -106,6 +106,7 @@ class Dataset:
         self.observations: Observations = model.observations
         self.views_record: ViewsRecord = views_record(model, cache.digests, self.test_indices, depths_sha256)
         self._depth_maps = depth_maps
+        self._axes_world = np.stack([view.rotation_cam_from_world[2] for view in model.views])
         self.has_known_distances: bool = depth_maps is not None
         self.has_masks: bool = len(cache.mask.values) > 0
         self._mask_is_alpha = masks == "alpha"
@@ -316,8 +317,7 @@ class Dataset:
         view, y, x = as_int64(view), as_int64(y), as_int64(x)
         depth = self._depth_maps.z_world(view, y, x, self._view_rays.sizes)
         _, directions = self._view_rays.trace(view, y, x)
-        axes = np.stack([each.rotation_cam_from_world[2] for each in self.views])
-        along = np.einsum("nk,nk->n", directions, axes[view])
+        along = np.einsum("nk,nk->n", directions, self._axes_world[view])
         # pixels of weight 0 and rays beside or behind the plane of the camera know nothing
         known = (depth > 0) & (along > MIN_AXIS_COSINE) & ~self._view_rays.invalid_rays(view, y, x)
         return np.divide(depth, along, out=np.zeros(len(view)), where=known).astype(np.float32)

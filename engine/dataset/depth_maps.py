@@ -232,13 +232,11 @@ def _depth_ratios(
 ) -> Float64[np.ndarray, " k"]:
     """Return depths of observed sparse points in the model over those in the maps."""
     points, seen = model.points, model.observations
-    if not len(points) or not len(seen):
-        return np.zeros(0)
-    rows = np.minimum(np.searchsorted(points.ids, seen.point), len(points) - 1)
+    rows, is_there = points.rows_of(seen.point)
     sizes = np.array([[view.width_px, view.height_px] for view in model.views], np.int64)
     column, row = np.floor(seen.xy_px).astype(np.int64).T
     width, height = sizes[seen.view].T
-    counted = (points.ids[rows] == seen.point) & np.isin(seen.view, views)
+    counted = is_there & np.isin(seen.view, views)
     counted &= (column >= 0) & (row >= 0) & (column < width) & (row < height)
     view, rows, column, row = seen.view[counted], rows[counted], column[counted], row[counted]
     axes = np.stack([each.rotation_cam_from_world[2] for each in model.views])

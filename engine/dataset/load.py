@@ -9,6 +9,7 @@ from jaxtyping import Float64
 
 from octasplat.engine.core.errors import ConfigError, DatasetError
 from octasplat.engine.core.local_origin import Origin, describe_origin, is_set
+from octasplat.engine.core.name_lists import name_list
 from octasplat.engine.core.relative_paths import normalize_name
 from octasplat.engine.core.scene_layout import (
     DEPTH_FOLDERS,
@@ -138,7 +139,7 @@ def _find_images(
         unread = sorted(match_image_names(missing, files_below(folder).keys() - on_disk.keys()).values())
         raise DatasetError(
             f"{len(missing)} of {len(names)} images of the model are not in {folder} "
-            f"({_name_list(missing)}); "
+            f"({name_list(missing)}); "
             + (" ".join(left_out_sentences(unread)) or "put them there or run COLMAP without them.")
         )
     respelt = {name: found[name] for name in names if normalize_name(name) != found[name]}
@@ -157,7 +158,7 @@ def _find_images(
     unposed = sorted(set(on_disk) - posed - owners.keys())
     if unposed and warn_unposed:
         warnings.append(
-            f"{len(unposed)} images in {folder} have no pose and are left out ({_name_list(unposed)})."
+            f"{len(unposed)} images in {folder} have no pose and are left out ({name_list(unposed)})."
         )
     # A file that the model has a pose for is a photograph, whatever its name ends with.
     beside = {owner: on_disk[mask] for mask, owner in owners.items() if mask not in posed}
@@ -180,7 +181,7 @@ def _named_masks(folder: Path, masks: Mapping[str, str], warnings: list[str]) ->
     if gone:
         warnings.append(
             f"{len(gone)} masks that the transforms file names are neither in masks/ nor beside the "
-            f"photographs ({_name_list(gone)}); put them into masks/."
+            f"photographs ({name_list(gone)}); put them into masks/."
         )
     return there
 
@@ -200,7 +201,7 @@ def _mask_paths(root: Path, located: _LocatedImages, warnings: list[str]) -> lis
             f"({names[0]}.png)."
         )
     elif without:
-        warnings.append(f"{len(without)} images have no mask and count whole ({_name_list(without)}).")
+        warnings.append(f"{len(without)} images have no mask and count whole ({name_list(without)}).")
     return masks
 
 
@@ -225,7 +226,7 @@ def _depth_paths(
             f"({PurePosixPath(names[0]).stem}.png)."
         )
     elif without:
-        warnings.append(f"{len(without)} photographs have no depth map ({_name_list(without)}).")
+        warnings.append(f"{len(without)} photographs have no depth map ({name_list(without)}).")
     return found
 
 
@@ -251,13 +252,9 @@ def _warn_of_other_models(root: Path, taken: Path, warnings: list[str]) -> None:
         described = [name if count is None else f"{name} of {count} images" for name, count in others.items()]
         size = f" of {posed_image_count(taken)} images" * taken.is_dir()
         warnings.append(
-            f"{root} holds further models ({len(others)}): {_name_list(described)}; only "
+            f"{root} holds further models ({len(others)}): {name_list(described)}; only "
             f"{taken}{size} is used; --model {next(iter(others))} takes another."
         )
-
-
-def _name_list(names: list[str]) -> str:
-    return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
 
 
 def _model_of_views(

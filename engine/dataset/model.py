@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32, Int64
+from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 from octasplat.engine.core.local_origin import NO_ORIGIN, Origin
 from octasplat.engine.dataset.camera import Camera
@@ -72,6 +72,16 @@ class SparsePoints:
 
     def __len__(self) -> int:
         return len(self.xyz_world)
+
+    def rows_of(self, ids: Int64[np.ndarray, " k"]) -> tuple[Int64[np.ndarray, " k"], Bool[np.ndarray, " k"]]:
+        """Return the row of each of COLMAP's numbers, and whether there is a point of that number.
+
+        Models name points that are not there, as in a part of a larger model; their rows are any.
+        """
+        if len(self) == 0:
+            return np.zeros(len(ids), np.int64), np.zeros(len(ids), np.bool_)
+        rows = np.minimum(np.searchsorted(self.ids, ids), len(self) - 1)
+        return rows, self.ids[rows] == ids
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,9 +1,9 @@
 """Where a scene keeps the poses of its photographs: COLMAP models by their folders, or transforms files."""
 
-from collections.abc import Iterable
 from pathlib import Path
 
 from octasplat.engine.core.errors import DatasetError
+from octasplat.engine.core.name_lists import name_list
 from octasplat.engine.dataset.colmap_reading import MODEL_FILES
 from octasplat.engine.dataset.transforms_file import transforms_file
 
@@ -40,7 +40,7 @@ def find_model(root: Path, chosen: str | None = None) -> Path:
         return file
     found = _models_elsewhere(root)
     verb = "is" if len(found) == 1 else "are"
-    described = f" {_name_list(found)} {verb} there; name the folder above as the scene."
+    described = f" {name_list(found, _MAX_NAMES)} {verb} there; name the folder above as the scene."
     raise DatasetError(
         f"{root} holds no COLMAP model; put cameras, images and points3D (.bin or .txt) into "
         f"{root / 'sparse/0'}, or have the poses found: octasplat reconstruct with --poses auto, or "
@@ -100,7 +100,9 @@ def _chosen_model(root: Path, chosen: str) -> Path:
     present = [model.relative_to(root).as_posix() for model in models]
     present += [] if file is None else [file.name]
     there = (
-        f"there {'is' if len(present) == 1 else 'are'} {_name_list(present)}" if present else "there is none"
+        f"there {'is' if len(present) == 1 else 'are'} {name_list(present, _MAX_NAMES)}"
+        if present
+        else "there is none"
     )
     raise DatasetError(f"{root} holds no model {chosen}; {there}.")
 
@@ -147,8 +149,3 @@ def _missing_files(folder: Path) -> list[str]:
     if not all(by_form.values()):
         return []
     return by_form[".bin"] if len(by_form[".bin"]) < len(MODEL_FILES) else by_form[".txt"]
-
-
-def _name_list(names: Iterable[str]) -> str:
-    names = list(names)
-    return ", ".join(names[:_MAX_NAMES]) + (", ..." if len(names) > _MAX_NAMES else "")

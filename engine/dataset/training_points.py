@@ -27,9 +27,8 @@ def is_observed_by(
     """
     if len(points) == 0 or len(observations) == 0:
         return np.ones(len(points), np.bool_)
-    # An observation of a point that is not there gets a wrong row here; the next line drops it.
-    row = np.minimum(np.searchsorted(points.ids, observations.point), len(points) - 1)
-    counted = np.isin(observations.view, views) & (points.ids[row] == observations.point)
+    row, is_there = points.rows_of(observations.point)
+    counted = np.isin(observations.view, views) & is_there
     # A track may name a photograph twice, which tells no more than once.
     once = np.unique(np.stack([row[counted], observations.view[counted]], axis=1), axis=0)
     known = np.bincount(once[:, 0], minlength=len(points)) >= MIN_OBSERVATIONS

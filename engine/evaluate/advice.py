@@ -7,8 +7,15 @@ import numpy as np
 from jaxtyping import Float32
 from scipy.ndimage import laplace
 
+from octasplat.engine.core.name_lists import name_list
 from octasplat.engine.evaluate.view_metrics import ViewMetrics
-from octasplat.engine.evaluate.view_support import GROUP_NAMES, Support, gain_if_covered, group_errors
+from octasplat.engine.evaluate.view_support import (
+    FEW_VIEWS,
+    GROUP_NAMES,
+    Support,
+    gain_if_covered,
+    group_errors,
+)
 
 MIN_COVERAGE_GAIN_DB = 0.5
 """What more photographs of badly covered places would have to gain to be asked for."""
@@ -25,8 +32,7 @@ OVERFITTED_DB = 3.0
 """From this difference on a longer training gains little on new views."""
 GOOD_PSNR = 33.0
 """Training views from which on more fit is not asked for."""
-_MAX_NAMES = 3
-_FEW_NAMES = GROUP_NAMES[:3]
+_FEW_NAMES = GROUP_NAMES[:FEW_VIEWS]
 
 
 @dataclass(frozen=True)
@@ -71,7 +77,7 @@ def advise(
         sentences.append(coverage)
     changed = _of_other_colors(views)
     if changed:
-        names = _name_list([view.name for view in changed])
+        names = name_list([view.name for view in changed])
         ways = "Lock exposure and white balance of the camera" + (
             "." if learns_exposure else ", or let the training learn them (--set exposure=true)."
         )
@@ -86,7 +92,7 @@ def advise(
     ]
     if blurred:
         sentences.append(
-            f"{len(blurred)} held-out photographs are less sharp than their renders ({_name_list(blurred)}). "
+            f"{len(blurred)} held-out photographs are less sharp than their renders ({name_list(blurred)}). "
             "Leave blurred photographs out."
         )
     finite = [view.psnr for view in views if np.isfinite(view.psnr)]
@@ -126,7 +132,7 @@ def _about_coverage(facts: Mapping[str, ViewFacts]) -> str | None:
     return (
         f"More photographs would help: {100 * pixels:.0f} % of the held-out pixels show places that at most "
         f"two training photographs see from within 15 degrees, and {100 * error:.0f} % of the error lies "
-        f"there.{gain} Take more around these views: {_name_list(worst)}"
+        f"there.{gain} Take more around these views: {name_list(worst)}"
     )
 
 
@@ -143,7 +149,3 @@ def _about_fit(training_psnr: float, held_out_psnr: float, *, is_covered: bool) 
             "help, a longer training hardly."
         ]
     return []
-
-
-def _name_list(names: Sequence[str]) -> str:
-    return ", ".join(names[:_MAX_NAMES]) + (", ..." if len(names) > _MAX_NAMES else "")

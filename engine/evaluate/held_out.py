@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numba
 import numpy as np
+from jaxtyping import Float32
 
 from octasplat.engine.core.color import composite_over
 from octasplat.engine.core.events import EventListener, PhaseProgress, Warned, read_events
@@ -108,7 +109,7 @@ def evaluate_held_out(
         images.offer(
             view.name,
             measured.metrics.psnr,
-            ViewImages(view.reference, view.render, measured.flip_map, view.layers),
+            ViewImages(view.reference, view.render, measured.flip_map, _report_layers(view)),
         )
         progress(PhaseProgress("evaluate", len(rows), len(dataset.test_indices)))
     # One warning of another world is enough.
@@ -153,9 +154,16 @@ def _write_images(view: RenderedView, output: Path, name: str) -> None:
     write_png(output / RENDERS / f"{name}.png", view.render)
     if ALBEDO in view.layers:
         for layer, display in view.layers.items():
-            if layer == COVERAGE:
-                continue
             write_png(output / LAYERS / layer / f"{name}.png", display)
+
+
+def _report_layers(view: RenderedView) -> dict[str, Float32[np.ndarray, "h w 3"]]:
+    """Return the layers of a view that the report shows: its own, and its coverage where that is known."""
+    layers = dict(view.layers)
+    if view.support is not None:
+        height, width = view.weight.shape
+        layers[COVERAGE] = coverage_picture(view.support, width, height, grid_stride(height, width))
+    return layers
 
 
 def _as_warnings(message: str | None, progress: EventListener) -> list[Warned]:
@@ -186,20 +194,19 @@ def _render_views(
             view = dataset.views[index]
             measures.add(view.name, image, rays, view.rotation_cam_from_world[2])
         reference = composite_over(rgb, alpha, color)
-        layers, support = display_layers(image), None
+        support = None
         if int(index) in asked:
-            height, width = weight.shape
-            stride = grid_stride(width, height)
             error = ((image.rgb_srgb - reference).astype(np.float64) ** 2).mean(axis=2)
-            support = measure_support(dataset, tracer, rays, image.depth_median, error, weight, stride)
-            layers[COVERAGE] = coverage_picture(support, width, height, stride)
+            support = measure_support(
+                dataset, tracer, rays, image.depth_median, error, weight, grid_stride(*weight.shape)
+            )
         yield RenderedView(
             name=dataset.views[index].name,
             render=image.rgb_srgb,
             reference=reference,
             weight=weight,
             alpha=alpha if dataset.has_alpha else None,
-            layers=layers,
+            layers=display_layers(image),
             support=support,
             depth_spread=depth_spread(image.depth, image.depth_median, weight),
         )

@@ -112,7 +112,7 @@ def measure_support(
     return Support(rows, counts, squared_error.reshape(-1)[rows])
 
 
-def grid_stride(width_px: int, height_px: int) -> int:
+def grid_stride(height_px: int, width_px: int) -> int:
     """Return the pixels between two that are asked, so that a view has about :data:`MAX_POINTS` of them."""
     return max(1, math.ceil(math.sqrt(width_px * height_px / MAX_POINTS)))
 
@@ -153,9 +153,7 @@ def measure_points(
     seen = np.flatnonzero(dataset.observations.view == index)
     if len(seen) == 0 or len(dataset.points) == 0:
         return PointDepths(np.zeros(0), np.zeros(0))
-    ids = dataset.observations.point[seen]
-    row = np.minimum(np.searchsorted(dataset.points.ids, ids), len(dataset.points) - 1)
-    known = dataset.points.ids[row] == ids
+    row, known = dataset.points.rows_of(dataset.observations.point[seen])
     seen, row = seen[known], row[known]
     height, width = depth_median.shape
     x, y = dataset.observations.xy_px[seen].astype(np.int64).T

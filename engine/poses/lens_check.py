@@ -56,10 +56,7 @@ def _observations_by_view(
     viewpoints: Viewpoints, points: SparsePoints, observations: Observations
 ) -> list[tuple[Float64[np.ndarray, "k 3"], Float64[np.ndarray, "k 2"]]]:
     """Return the sparse points that each view observes (world), and their image positions (px)."""
-    if len(points) == 0:
-        return [(np.zeros((0, 3)), np.zeros((0, 2))) for _ in viewpoints.views]
-    place = np.minimum(np.searchsorted(points.ids, observations.point), len(points) - 1)
-    known = points.ids[place] == observations.point
+    place, known = points.rows_of(observations.point)
     view, place, xy_px = observations.view[known], place[known], observations.xy_px[known]
     order = np.argsort(view, kind="stable")
     ends = np.searchsorted(view[order], np.arange(len(viewpoints.views) + 1))

@@ -22,8 +22,8 @@ def mean_view_directions(dataset: Dataset) -> Float64[np.ndarray, "n 3"]:
     sums = np.zeros((len(points), 3))
     if len(points) == 0 or len(observations) == 0:
         return sums
-    row = np.minimum(np.searchsorted(points.ids, observations.point), len(points) - 1)
-    known = (points.ids[row] == observations.point) & np.isin(observations.view, dataset.train_indices)
+    row, is_there = points.rows_of(observations.point)
+    known = is_there & np.isin(observations.view, dataset.train_indices)
     row, view = row[known], observations.view[known]
     centres = np.stack([v.origin_world for v in dataset.views])
     ways = centres[view] - points.xyz_world[row]

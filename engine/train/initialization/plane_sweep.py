@@ -178,8 +178,7 @@ def _observed_distances(dataset: Dataset) -> Float64[np.ndarray, " v"]:
     observations, points = dataset.observations, dataset.points
     if len(points) == 0 or len(observations) == 0:
         return result
-    row = np.minimum(np.searchsorted(points.ids, observations.point), len(points) - 1)
-    known = points.ids[row] == observations.point
+    row, known = points.rows_of(observations.point)
     origins = np.stack([view.origin_world for view in dataset.views])
     all_distances = np.linalg.norm(
         points.xyz_world[row].astype(np.float64) - origins[observations.view], axis=1

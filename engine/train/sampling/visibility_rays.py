@@ -69,9 +69,8 @@ class VisibilityRays:
         that sight ends the sooner before points of photographs that were made smaller.
         """
         observations, points = dataset.observations, dataset.points
-        row = np.searchsorted(points.ids, observations.point)
-        row = np.minimum(row, len(points) - 1)
-        keep = np.isin(observations.view, dataset.train_indices) & (points.ids[row] == observations.point)
+        row, is_there = points.rows_of(observations.point)
+        keep = np.isin(observations.view, dataset.train_indices) & is_there
         row, view = row[keep], observations.view[keep]
         origins = np.stack([each.origin_world for each in dataset.views])
         offset = points.xyz_world[row].astype(np.float64) - origins[view]
