@@ -24,6 +24,8 @@ FIRST_ITERATION = "first-iteration"
 """The group of what a reconstruction calls until the end of its first iterations."""
 MAX_PROCESSES = 2
 """More compile the functions that kernels share once more each."""
+MIN_SECONDS_BESIDE = 6.0
+"""Below it, processes that first load the compiler would take more CPU time and end no earlier."""
 
 
 class KernelSignature(NamedTuple):
@@ -123,10 +125,11 @@ def compile_now(groups: Sequence[str]) -> None:
 def compile_beside(groups: Sequence[str]) -> Iterator[None]:
     """Compile what is missing of the groups in processes beside this one, which are ended with the context.
 
-    Where there is one core, this process compiles what it calls by itself.
+    Where there is one core, or little is missing, this process compiles what it calls by itself.
     """
     count = min(MAX_PROCESSES, available_threads())
-    with _ended(start_compiling(groups, count) if count > 1 and missing_kernels(groups) else []):
+    is_worth_it = count > 1 and cold_start_seconds(groups) > MIN_SECONDS_BESIDE
+    with _ended(start_compiling(groups, count) if is_worth_it else []):
         yield
 
 

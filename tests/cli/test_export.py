@@ -2,7 +2,9 @@
 
 import json
 import re
+import shutil
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from octasplat.engine.core.ply_container import PlyWriteElement, write_ply
 from octasplat.engine.files import read_scene
-from octasplat.engine.files.gaussian_ply import read_gaussian_ply
+from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from octasplat.engine.render.depth_order import MIN_AGREEMENT, shared_depth_order
 from octasplat.engine.runs.run_folder import run_viewpoints
 
@@ -30,6 +32,41 @@ def glb_json(path):
     content = path.read_bytes()
     (length,) = struct.unpack("<I", content[12:16])
     return json.loads(content[20 : 20 + length])
+
+
+def test_colors_of_a_run_are_kept_for_later_exports(run, octasplat, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(run.output, folder)
+    kept = folder / "cache" / "camera_colors.npz"
+
+    def write_scene(seed: int) -> None:
+        gaussians, _ = read_gaussian_ply(run.output / "scene.ply")
+        random = np.random.default_rng(seed)
+        sh = 0.3 * random.standard_normal((len(gaussians), 4, 3)).astype(np.float32)
+        write_gaussian_ply(replace(gaussians, sh=sh), folder / "scene.ply")
+
+    def exported(name: str) -> bytes:
+        result = octasplat("export", folder, tmp_path / name)
+        assert result.exit_code == 0, result.output
+        return (tmp_path / name).read_bytes()
+
+    write_scene(0)
+    first = exported("first.glb")
+    with np.load(kept) as content:
+        arrays = dict(content)
+    assert exported("second.glb") == first
+    # colors that are kept are taken, and no rays traced for them
+    np.savez(kept, **{**arrays, "colors": 1 - arrays["colors"]})
+    assert exported("inverted.glb") != first
+    # those of another scene are not, nor damaged ones
+    np.savez(kept, key=np.array("another"), colors=1 - arrays["colors"])
+    assert exported("other_key.glb") == first
+    kept.write_bytes(kept.read_bytes()[:100])
+    assert exported("damaged.glb") == first
+    write_scene(1)
+    exported("edited.glb")
+    with np.load(kept) as content:
+        assert str(content["key"]) != str(arrays["key"])
 
 
 def test_options_reach_a_glb(run, octasplat, tmp_path):
