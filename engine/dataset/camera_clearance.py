@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
-from scipy.spatial import cKDTree
 
 from octasplat.engine.dataset.model import PosedView, SparsePoints, Viewpoints
 
@@ -27,6 +26,8 @@ def camera_clearances(viewpoints: Viewpoints, points: SparsePoints) -> Float64[n
     """
     if len(points) < MIN_POINTS:
         return np.zeros(len(viewpoints.views))
+    from scipy.spatial import cKDTree  # here, as most who import this module ask for no radius
+
     origins = np.stack([view.origin_world for view in viewpoints.views])
     distances, _ = cKDTree(points.xyz_world.astype(np.float64)).query(origins, k=[NEAREST_QUANTILE])
     return np.asarray(distances[:, 0], np.float64)
@@ -61,6 +62,8 @@ class CameraClearance:
         around = np.flatnonzero(self.radii > 0)
         if len(xyz_world) == 0 or len(around) == 0:
             return inside
+        from scipy.spatial import cKDTree
+
         # What is farther from every camera than the largest ball reaches is in none of them.
         origins = np.stack([self.views[i].origin_world for i in around.tolist()])
         reach = float(self.radii.max())

@@ -14,9 +14,6 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, Int64
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.dataset.image_info import Storage
@@ -124,6 +121,8 @@ class _Poses:
 
 def _near_pictures(model: DatasetModel, poses: _Poses, known: set[Group]) -> list[Group]:
     """Return pairs of views of nearly one pose and nearly one picture, without those known already."""
+    from scipy.spatial import cKDTree  # here, as most who import this module compare nothing
+
     close = cKDTree(poses.centres).query_pairs(NEAR_SHIFT * poses.extent, output_type="ndarray")
     near = poses.near_pairs(close.astype(np.int64), NEAR_SHIFT, NEAR_TURN_RAD)
     pairs = [pair for pair in near if pair not in known]
@@ -155,6 +154,9 @@ def _rms_difference(one: Float32[np.ndarray, "h w 3"], two: Float32[np.ndarray, 
 
 def _merge_overlapping_groups(count: int, groups: Sequence[Group]) -> tuple[Group, ...]:
     """Return the groups with those that share a view made one, of two views or more."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
     # Each group links its first view with all of its views; connected groups become one.
     rows = [group[0] for group in groups for _ in group]
     columns = [index for group in groups for index in group]

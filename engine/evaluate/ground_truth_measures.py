@@ -24,7 +24,7 @@ from octasplat.engine.evaluate.ground_truth_metrics import (
 )
 from octasplat.engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS
 from octasplat.engine.pathtracing.environment import EnvironmentMap, environment_frame
-from octasplat.engine.pathtracing.relighting.path_relighter import Relighter, RelitImage
+from octasplat.engine.pathtracing.relighting.relighter import Relighter, RelitImage
 from octasplat.engine.render.environment_files import read_environment
 from octasplat.engine.render.renderer import RenderedImage
 

@@ -4,11 +4,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
-from scipy.optimize import minimize_scalar
 
 from octasplat.engine.core.color import linear_to_srgb
 from octasplat.engine.pathtracing.environment import EnvironmentMap
-from octasplat.engine.pathtracing.lights import build_light_arrays, eval_environment_map
 
 _OCTAVES = 8.0
 """Scales are looked for between 2 to the power of minus and plus this."""
@@ -93,6 +91,8 @@ def fit_channel_scales(
 
     Least squares, between 1/256 and 256; 1 where a channel is black.
     """
+    from scipy.optimize import minimize_scalar
+
     step = -(-len(linear) // MOST_FITTED)  # rounded up
     scales = np.ones(3)
     weight = 1.0 if weights is None else weights[::step].astype(np.float64)
@@ -131,6 +131,8 @@ def environment_errors(
         [sine * np.sin(around), np.broadcast_to(cosine, (height, width)), sine * np.cos(around)], axis=-1
     )
     directions = (local @ true.frame).reshape(-1, 3)  # frame: right, up, forward as rows
+    from octasplat.engine.pathtracing.lights import build_light_arrays, eval_environment_map
+
     lights = build_light_arrays((), ours.frame[1], ours)
     found, _ = eval_environment_map(lights, directions)
     true_radiance = true.radiance_linear.reshape(-1, 3).astype(np.float64)

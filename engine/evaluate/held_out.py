@@ -32,7 +32,7 @@ from octasplat.engine.evaluate.view_support import coverage_picture, grid_stride
 from octasplat.engine.gaussians.materials import ALBEDO
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.pathtracing.environment import EnvironmentMap
-from octasplat.engine.pathtracing.relighting.path_relighter import Relighter
+from octasplat.engine.pathtracing.relighting.relighter import Relighter
 from octasplat.engine.render.file_names import unique_render_names
 from octasplat.engine.render.image_files import write_png
 from octasplat.engine.render.renderer import background_color, front_normals

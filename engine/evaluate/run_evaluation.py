@@ -24,7 +24,6 @@ from octasplat.engine.files import read_metadata
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
 from octasplat.engine.gaussians.materials import has_materials
 from octasplat.engine.pathtracing.environment import EnvironmentMap, environment_frame
-from octasplat.engine.pathtracing.relighting.split_sum_relighter import SplitSumRelighter
 from octasplat.engine.poses.find_poses import read_pose_record
 from octasplat.engine.render.environment_files import read_environment
 from octasplat.engine.render.renderer import background_color
@@ -210,6 +209,8 @@ def measure_run(
     environment = _read_run_environment(output, config.train.materials.up_world)
     relighter = None
     if truth is not None and truth.relit_folders and environment is not None and has_materials(gaussians):
+        from octasplat.engine.pathtracing.relighting.split_sum_relighter import SplitSumRelighter
+
         relighter = SplitSumRelighter(
             gaussians, config.train.trace, config.train.materials, extent_world=extent, threads=threads
         )

@@ -18,7 +18,7 @@ from octasplat.engine.settings.fields import ADVANCED, InputFile, ReadPath, Spel
 if TYPE_CHECKING:
     from octasplat.engine.dataset import Viewpoints
     from octasplat.engine.operations.render_source import RenderSource
-    from octasplat.engine.pathtracing.relighting.path_relighter import Relighter
+    from octasplat.engine.pathtracing.relighting.relighter import Relighter
     from octasplat.engine.render.shots import Shot
     from octasplat.engine.shading.material_settings import MaterialSettings
 

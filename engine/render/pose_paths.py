@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.interpolate import CubicHermiteSpline
-from scipy.spatial.transform import Rotation, RotationSpline
 
 from octasplat.engine.core.errors import ConfigError
 
@@ -174,6 +172,10 @@ class PosePath:
 
     def poses_at(self, times: Float64[np.ndarray, "k"]) -> Float64[np.ndarray, "k 4 4"]:
         """Return the poses at times from 0 to 1."""
+        # here, as most commands that import this module follow no path
+        from scipy.interpolate import CubicHermiteSpline
+        from scipy.spatial.transform import Rotation, RotationSpline
+
         key_times, order = self.key_times, np.arange(len(self.poses))
         if self.closed:
             # A few keys from the other end make the joint as smooth as the rest.

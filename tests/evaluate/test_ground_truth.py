@@ -21,7 +21,7 @@ from octasplat.engine.evaluate.ground_truth_metrics import (
     to_display,
 )
 from octasplat.engine.pathtracing.environment import EnvironmentMap, environment_frame
-from octasplat.engine.pathtracing.relighting.path_relighter import RelitImage
+from octasplat.engine.pathtracing.relighting.relighter import RelitImage
 from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.render.renderer import RenderedImage
 

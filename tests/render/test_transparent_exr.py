@@ -10,7 +10,7 @@ import pytest
 
 from octasplat.engine.core.color import linear_to_srgb, srgb_to_linear
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
-from octasplat.engine.pathtracing.relighting.path_relighter import Relighter
+from octasplat.engine.pathtracing.relighting.relighter import Relighter
 from octasplat.engine.pathtracing.relighting.relit_images import RelitRenderFn, ShotLighting
 from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.render.pose_paths import look_at

@@ -10,7 +10,8 @@ from jaxtyping import Float32, Float64
 from octasplat.engine.core.color import linear_to_srgb, srgb_to_linear
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.pathtracing.environment import EnvironmentMap, environment_frame
-from octasplat.engine.pathtracing.relighting.path_relighter import Relighter, render_environment
+from octasplat.engine.pathtracing.relighting.path_relighter import render_environment
+from octasplat.engine.pathtracing.relighting.relighter import Relighter
 from octasplat.engine.render.environment_files import read_environment
 from octasplat.engine.render.image_files import write_exr, write_png
 from octasplat.engine.render.renderer import background_color

@@ -7,7 +7,7 @@ from octasplat.engine.core.rays import ImageRays
 from octasplat.engine.gaussians.materials import AMBIENT, with_interreflection_channel
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.pathtracing.environment import EnvironmentMap
-from octasplat.engine.pathtracing.relighting.path_relighter import ProgressCallback, RelitImage, no_progress
+from octasplat.engine.pathtracing.relighting.relighter import ProgressCallback, RelitImage, no_progress
 from octasplat.engine.render.supersampling import pixel_means
 from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.shading.recipes import material_shading
@@ -21,7 +21,7 @@ ENVIRONMENT_HEIGHT_PX = 256
 class SplitSumRelighter:
     """Deferred shading with traced visibility; reflected hits are shaded by the split sum, too.
 
-    Follows :class:`octasplat.engine.pathtracing.relighting.path_relighter.Relighter`.
+    Follows :class:`octasplat.engine.pathtracing.relighting.relighter.Relighter`.
 
     Args:
         gaussians: a scene with materials.
