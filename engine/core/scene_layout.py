@@ -10,6 +10,8 @@ sparse, colmap/sparse, distorted/sparse, each also with a number below it: camer
 transforms.json, or transforms_train.json, transforms_test.json and transforms_val.json, and <name>.ply with
                                     the points that they name: poses as nerfstudio, instant-ngp and Blender
                                     scenes have them
+geometry.ply, .obj, .glb, .las, .laz    what is known of the geometry, see
+                                    :mod:`octasplat.engine.dataset.known_geometry`
 gcp_list.txt, control_points.csv    ground control points, see :mod:`octasplat.engine.georeference`
 """
 
@@ -46,6 +48,7 @@ _MODEL_FILE = re.compile(
     r"((colmap/|distorted/)?sparse(/[0-9]+)?/)?(cameras|images|points3D|rigs|frames)\.(bin|txt)"
 )
 _CONTROL_FILE = re.compile(r"gcp_list\.txt|control_points\.csv")
+_GEOMETRY_FILE = re.compile(r"geometry\.(ply|obj|glb|las|laz)", re.IGNORECASE)
 _POSES_FILE = re.compile(r"transforms(_train|_test|_val)?\.json")
 _POINTS_FILE = re.compile(r"[^/]+\.ply", re.IGNORECASE)
 _MODEL_ELSEWHERE = re.compile(r"(.*/)?images\.(bin|txt)")
@@ -67,11 +70,12 @@ class FileRole(Enum):
     DEPTH = "depth"
     MODEL = "model"
     CONTROL = "control"
+    GEOMETRY = "geometry"
     OTHER = "other"
 
 
 _DEPTHS = tuple((folder,) for folder in DEPTH_FOLDERS)
-_KEPT_ROLES = (FileRole.MODEL, FileRole.MASK, FileRole.DEPTH, FileRole.CONTROL)
+_KEPT_ROLES = (FileRole.MODEL, FileRole.MASK, FileRole.DEPTH, FileRole.CONTROL, FileRole.GEOMETRY)
 """Roles of files that keep their names; photographs are moved to ``images/``."""
 _ROLES_BY_FOLDER = {
     "images": FileRole.IMAGE,
@@ -135,7 +139,7 @@ def _unused_model_files(names: Iterable[str]) -> set[str]:
     unused = set() if any(form <= at_top for form in forms) else set(filter(_MODEL_FILE.fullmatch, at_top))
     if not at_top & {"transforms.json", "transforms_train.json"}:
         unused |= {name for name in at_top if _POSES_FILE.fullmatch(name) or _POINTS_FILE.fullmatch(name)}
-    return unused
+    return {name for name in unused if not is_geometry_file(name)}
 
 
 def is_photograph(name: str, results: Iterable[str] = ()) -> bool:
@@ -161,6 +165,8 @@ def file_role(name: str) -> FileRole:
     """Return what the file ``name``, relative to the scene, is."""
     if is_ignored_file(name):
         return FileRole.OTHER
+    if is_geometry_file(name):
+        return FileRole.GEOMETRY
     if any(pattern.fullmatch(name) for pattern in (_MODEL_FILE, _POSES_FILE, _POINTS_FILE)):
         return FileRole.MODEL
     if _CONTROL_FILE.fullmatch(name):
@@ -169,6 +175,11 @@ def file_role(name: str) -> FileRole:
     if slash and rest and _is_picture(rest):
         return _ROLES_BY_FOLDER.get(top, FileRole.OTHER)
     return FileRole.OTHER
+
+
+def is_geometry_file(name: str) -> bool:
+    """Return whether a file, by its path below the folder of the scene, is its known geometry."""
+    return _GEOMETRY_FILE.fullmatch(name) is not None
 
 
 def is_ignored_file(name: str) -> bool:

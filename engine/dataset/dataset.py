@@ -13,8 +13,15 @@ from octasplat.engine.core.local_origin import NO_ORIGIN, Origin
 from octasplat.engine.core.rays import ImageRays, RayBatch
 from octasplat.engine.dataset.camera import Camera
 from octasplat.engine.dataset.camera_clearance import camera_clearances
-from octasplat.engine.dataset.depth_maps import DepthMaps, depth_maps_digest, fit_unit, open_depth_maps
+from octasplat.engine.dataset.depth_maps import (
+    DepthMaps,
+    check_geometry,
+    depth_maps_digest,
+    fit_unit,
+    open_depth_maps,
+)
 from octasplat.engine.dataset.kernels import gather
+from octasplat.engine.dataset.known_geometry import KnownGeometry
 from octasplat.engine.dataset.load import load_dataset_model
 from octasplat.engine.dataset.model import DatasetModel, DatasetView, Observations, SparsePoints, Viewpoints
 from octasplat.engine.dataset.pixel_cache import PixelCache, file_digests, open_pixel_cache
@@ -66,7 +73,7 @@ class Dataset:
         trained_pixels: how often each pixel is drawn where there is a region; None stands for evenly.
         has_alpha: whether any pixel can have an alpha below 1.
         has_masks: whether any view has a mask.
-        has_known_distances: whether any view has a depth map.
+        has_known_distances: whether any view has a depth map, or geometry is known.
         extent: radius of the training cameras, see :func:`octasplat.engine.dataset.model.scene_extent`.
         near_world: distance from the cameras at which anything is seen: ``near`` of the extent, but at most
             :data:`NEAR_FROM_POINTS` of the least distance at which the sparse points around a training camera
@@ -149,6 +156,7 @@ class Dataset:
         model: str | None = None,
         region: Region | None = None,
         depth_unit: float | None = None,
+        geometry: KnownGeometry | None = None,
     ) -> "Dataset":
         """Load a scene and decode its photographs into ``cache_dir``, or reuse those already cached there.
 
@@ -176,6 +184,7 @@ class Dataset:
             region: the box to train in detail; None trains all of the scene alike.
             depth_unit: world units for one unit of the depth maps' values, see
                 :mod:`octasplat.engine.dataset.depth_maps`; None finds it by the sparse points.
+            geometry: a mesh or cloud of points that is known of the scene.
 
         Raises:
             DatasetError: something is missing, damaged or inconsistent.
@@ -189,17 +198,21 @@ class Dataset:
         # Fail before the expensive decoding.
         rule = SplitRule(test_every, held_out, burst_length, split, stored_split)
         parts = split_scene(scene, rule)
-        digests, depths_sha256, depth_maps = None, depth_maps_digest(scene), None
+        digests, depths_sha256, depth_maps = None, depth_maps_digest(scene, geometry), None
         if check_views is not None:
             digests = file_digests(scene, cache_dir, threads=threads)
             check_views(views_record(scene, digests, parts.test_indices, depths_sha256))
         if depths_sha256 is not None:
             depth_maps = open_depth_maps(
-                scene, cache_dir, depths_sha256, unit_world=depth_unit, threads=threads
+                scene, cache_dir, depths_sha256, unit_world=depth_unit, threads=threads, geometry=geometry
             )
-            if depth_unit is None:
+            notes = []
+            if depth_unit is None and any(view.depth_path is not None for view in scene.views):
                 depth_maps, note = fit_unit(depth_maps, scene, parts.train_indices)
-                scene = replace(scene, warnings=(*scene.warnings, note))
+                notes.append(note)
+            if geometry is not None:
+                notes.append(check_geometry(depth_maps, scene, parts.train_indices, geometry))
+            scene = replace(scene, warnings=(*scene.warnings, *notes))
         cache = open_pixel_cache(scene, cache_dir, digests, threads=threads, progress=progress)
         tables = open_ray_tables(scene.cameras, cache_dir, max_table_bytes)
         return cls(

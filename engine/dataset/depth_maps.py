@@ -8,6 +8,8 @@ sides and the same lens.
     depths/<name>.png   16-bit: millimetres unless a scale is stated
     depths/<name>.exr   or .tif: floating point; metres unless a scale is stated
 
+Photographs without a map of their own get that of the scene's known geometry, where there is one.
+
 The unit of a scene is that of its poses, which COLMAP chooses at will. Without a stated scale it is found by
 the sparse points: their depths in the model over those in the maps.
 """
@@ -17,24 +19,25 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import TypedDict
 
 import numpy as np
 import OpenImageIO as oiio
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.relative_paths import normalize_name
 from octasplat.engine.core.scene_layout import DEPTH_FOLDERS, IMAGE_SUFFIXES
 from octasplat.engine.core.writing import atomic_replace, write_json
 from octasplat.engine.dataset.images import open_image, read_pixels
+from octasplat.engine.dataset.known_geometry import GeometryDepths, KnownGeometry
 from octasplat.engine.dataset.mapped_array import MappedArray
 from octasplat.engine.dataset.model import DatasetModel
 from octasplat.engine.dataset.pixel_cache import file_sha256
 
-CACHE_VERSION = 2
+CACHE_VERSION = 3
 """Raised whenever the contents of the cache file change for the same maps."""
 INTEGER_UNIT = 0.001
 """Metres for one unit of integers, as depth cameras store them."""
@@ -42,6 +45,10 @@ MAX_STORED = 1e9
 """From this value on nothing is known."""
 MIN_POINTS = 50
 """So many observations of sparse points decide the scale."""
+GEOMETRY_TOLERANCE = 0.05
+"""Share of the depth within which a sparse point lies on the known geometry."""
+MIN_AGREEING = 1 / 3
+"""So many of the sparse points lie on it; others are on what it does not hold."""
 MAX_SPREAD = 0.1
 """Where half of the sparse points are farther off than this share, the maps do not belong to the model."""
 _INTEGERS = {oiio.UINT16: "uint16", oiio.INT16: "int16", oiio.UINT32: "uint32", oiio.INT32: "int32"}
@@ -57,12 +64,14 @@ class DepthMaps:
         offsets: first value of each view, and the count of all at the end; views without a map have none.
         sizes_px: width and height of each view's map.
         unit_world: world units for one unit of the stored values, by view.
+        are_of_geometry: which of them come from the known geometry, in world units.
     """
 
     values: MappedArray
     offsets: Int64[np.ndarray, " views_and_end"]
     sizes_px: Int64[np.ndarray, "v 2"]
     unit_world: Float64[np.ndarray, " v"]
+    are_of_geometry: Bool[np.ndarray, " v"]
 
     def z_world(
         self,
@@ -148,15 +157,21 @@ def read_depth_map(path: Path) -> tuple[Float32[np.ndarray, "h w"], bool]:
     return np.where(known, depth, np.float32(0.0)), stored is not None
 
 
-def depth_maps_digest(model: DatasetModel) -> str | None:
+def depth_maps_digest(model: DatasetModel, geometry: KnownGeometry | None = None) -> str | None:
     """Return one digest of all depth maps of a scene, and of which photograph each belongs to; None without.
+
+    Args:
+        model: the scene.
+        geometry: what is known beside the maps.
 
     Raises:
         DatasetError: a file cannot be read.
     """
-    if all(view.depth_path is None for view in model.views):
+    if geometry is None and all(view.depth_path is None for view in model.views):
         return None
     total = hashlib.sha256()
+    if geometry is not None:
+        total.update(f"geometry\0{geometry.sha256}\0".encode())
     for view in model.views:
         if view.depth_path is not None:
             total.update(f"{view.name}\0{file_sha256(view.depth_path)}\0".encode())
@@ -164,7 +179,13 @@ def depth_maps_digest(model: DatasetModel) -> str | None:
 
 
 def open_depth_maps(
-    model: DatasetModel, folder: Path, digest: str, *, unit_world: float | None = None, threads: int = 1
+    model: DatasetModel,
+    folder: Path,
+    digest: str,
+    *,
+    unit_world: float | None = None,
+    threads: int = 1,
+    geometry: KnownGeometry | None = None,
 ) -> DepthMaps:
     """Map the depth maps of a scene, decoding them into ``folder`` first unless they are there already.
 
@@ -175,21 +196,28 @@ def open_depth_maps(
         unit_world: world units for one unit of the stored values; None takes millimetres for integers and
             metres for others.
         threads: for decoding; 0 takes one per processor.
+        geometry: gives maps to the photographs that have none.
 
     Raises:
-        DatasetError: a map cannot be used.
+        DatasetError: a map, or the geometry, cannot be used.
+        SceneFileError: likewise.
         OutputError: the cache cannot be written.
     """
-    index = _read_index(folder, digest, [view.depth_path is not None for view in model.views])
+    have_maps = [geometry is not None or view.depth_path is not None for view in model.views]
+    index = _read_index(folder, digest, have_maps)
     if index is None:
-        index = _decode(model, folder, digest, threads)
+        index = _decode(model, folder, digest, threads, geometry)
     sizes = np.array(index["sizes_px"], np.int64)
     units = np.where(index["are_integers"], INTEGER_UNIT, 1.0)
+    if unit_world is not None:
+        units = np.full(len(units), float(unit_world))
+    of_geometry = np.array([geometry is not None and view.depth_path is None for view in model.views])
     return DepthMaps(
         MappedArray.open(folder / _VALUES, np.float32),
         np.concatenate([[0], np.cumsum(sizes.prod(axis=1))]).astype(np.int64),
         sizes,
-        units if unit_world is None else np.full(len(units), float(unit_world)),
+        np.where(of_geometry, 1.0, units),
+        of_geometry,
     )
 
 
@@ -204,7 +232,7 @@ def fit_unit(maps: DepthMaps, model: DatasetModel, views: Int64[np.ndarray, " t"
     Raises:
         DatasetError: no one scale makes the maps fit the points.
     """
-    ratios = _depth_ratios(maps, model, views)
+    ratios = _depth_ratios(maps, model, views[~maps.are_of_geometry[views]])
     count = sum(view.depth_path is not None for view in model.views)
     if len(ratios) < MIN_POINTS:
         return maps, (
@@ -220,10 +248,52 @@ def fit_unit(maps: DepthMaps, model: DatasetModel, views: Int64[np.ndarray, " t"
             "along the axis of view (z) of these photographs; mend them, take the folder away, or state "
             "their unit (--depth-unit)."
         )
-    fitted = DepthMaps(maps.values, maps.offsets, maps.sizes_px, maps.unit_world * scale)
+    fitted = replace(maps, unit_world=np.where(maps.are_of_geometry, 1.0, maps.unit_world * scale))
     return fitted, (
         f"The depth maps of {count} photographs are used: one metre of theirs is {scale:.4g} units of the "
         f"scene, by {len(ratios)} sparse points, half of which agree within {100 * spread:.1f} %."
+    )
+
+
+def check_geometry(
+    maps: DepthMaps, model: DatasetModel, views: Int64[np.ndarray, " t"], geometry: KnownGeometry
+) -> str:
+    """Check by the sparse points that the known geometry stands where the photographs show it.
+
+    Args:
+        maps: of the scene, those of the geometry among them.
+        model: the scene.
+        views: training views, whose observations count.
+        geometry: of the scene.
+
+    Returns:
+        A sentence about it.
+
+    Raises:
+        DatasetError: no photograph shows it, or it stands elsewhere.
+    """
+    shown = maps.values.values
+    seeing = sum(
+        bool(shown[first:last].any())
+        for first, last, counts in zip(maps.offsets[:-1], maps.offsets[1:], maps.are_of_geometry, strict=True)
+        if counts
+    )
+    way_out = "it must be in the coordinates of the poses; move it there, or take the file away."
+    if seeing == 0 and maps.are_of_geometry.any():
+        raise DatasetError(f"{geometry.path} is seen by none of the photographs: {way_out}")
+    ratios = _depth_ratios(maps, model, views[maps.are_of_geometry[views]])
+    told = f"{geometry.path.name} is taken as known geometry; {seeing} photographs see it"
+    if len(ratios) < MIN_POINTS:
+        return f"{told}, and too few sparse points lie on it to show whether it stands right."
+    share = float((np.abs(ratios - 1) < GEOMETRY_TOLERANCE).mean())
+    if share < MIN_AGREEING:
+        raise DatasetError(
+            f"{geometry.path} does not stand where the photographs show it: of {len(ratios)} sparse points "
+            f"{100 * share:.0f} % lie within {100 * GEOMETRY_TOLERANCE:.0f} % of its depth: {way_out}"
+        )
+    return (
+        f"{told}, and {100 * share:.0f} % of {len(ratios)} sparse points lie within "
+        f"{100 * GEOMETRY_TOLERANCE:.0f} % of its depth."
     )
 
 
@@ -268,7 +338,9 @@ def _read_index(folder: Path, digest: str, have_maps: Sequence[bool]) -> _Index 
     return index if is_whole and is_same else None
 
 
-def _decode(model: DatasetModel, folder: Path, digest: str, threads: int) -> _Index:
+def _decode(
+    model: DatasetModel, folder: Path, digest: str, threads: int, geometry: KnownGeometry | None
+) -> _Index:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / _INDEX).unlink(missing_ok=True)  # an index must never describe a file that is being written
     sizes_px: list[list[int]] = []
@@ -278,12 +350,17 @@ def _decode(model: DatasetModel, folder: Path, digest: str, threads: int) -> _In
         atomic_replace(folder / _VALUES) as path,
         path.open("wb") as file,
     ):
+        of_geometry = None
+        if geometry is not None:
+            of_geometry = GeometryDepths(geometry.read().about(model.origin_world), threads)
         paths = (view.depth_path for view in model.views)
         decoded = pool.map(lambda path: None if path is None else read_depth_map(path), paths)
         for view, found in zip(model.views, decoded, strict=True):
             depth, is_integer = (np.zeros((0, 0), np.float32), False) if found is None else found
             if found is not None:
                 _check_sides(view.depth_path, depth.shape, (view.width_px, view.height_px))
+            elif of_geometry is not None:
+                depth = of_geometry.view(view, model.cameras[view.camera_index])
             sizes_px.append([depth.shape[1], depth.shape[0]])
             are_integers.append(is_integer)
             file.write(depth.tobytes())

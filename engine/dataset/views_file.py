@@ -194,7 +194,7 @@ class ViewsRecord(_FrozenModel):
         if self.points_sha256 != other.points_sha256:
             return "other sparse points"
         if self.depths_sha256 != other.depths_sha256:
-            return "other depth maps"
+            return "other depth maps or another known geometry"
         return None if self == other else "another split"
 
     def is_of_same_world(self, other: "ViewsRecord") -> bool:
@@ -252,7 +252,7 @@ def views_record(
         model: the scene.
         digests: of the files of its views, in their order.
         test_indices: views that are held out; where all are, they give the extent.
-        depths_sha256: digest of the depth maps, where there are any.
+        depths_sha256: digest of the depth maps and the known geometry, where there are any.
     """
     held_out = set(test_indices.tolist())
     train = [index for index in range(len(model.views)) if index not in held_out] or sorted(held_out)

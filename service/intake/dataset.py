@@ -16,6 +16,7 @@ from octasplat.workers.storage.protocol import Storage
 from octasplat.workers.storage.trees import TreeFile
 
 _MAX_FAULTS = 100
+_ROLES_WITHOUT_PIXELS = (FileRole.MODEL, FileRole.CONTROL, FileRole.GEOMETRY)
 DEFAULT_IMAGE_LIMITS = ImageLimits()
 
 
@@ -90,7 +91,7 @@ def check_file_content(
         IntakeError: the header is refused, or the file was cut off.
         StorageError: the content cannot be had.
     """
-    if file_role(name) in (FileRole.MODEL, FileRole.CONTROL):
+    if file_role(name) in _ROLES_WITHOUT_PIXELS:
         return None
     with storage.open(sha256) as file:
         header = read_image_header(file, name, limits)
@@ -185,7 +186,7 @@ def _image_sizes(
 ) -> dict[str, tuple[int, int]]:
     sizes: dict[str, tuple[int, int]] = {}
     for file in files:
-        if file_role(file.path) in (FileRole.MODEL, FileRole.CONTROL):
+        if file_role(file.path) in _ROLES_WITHOUT_PIXELS:
             continue
         if file.width_px is not None and file.height_px is not None:
             sizes[file.path] = file.width_px, file.height_px

@@ -34,8 +34,8 @@ def check_scene_file(name: str) -> FileRole:
         raise IntakeError(
             IntakeFault(
                 "name-unexpected",
-                f"{quoted_name(name)} is no part of a scene; these are images/, masks/, depths/ and the "
-                "COLMAP model in sparse/0.",
+                f"{quoted_name(name)} is no part of a scene; these are images/, masks/, depths/, "
+                "geometry.ply and the COLMAP model in sparse/0.",
                 name,
             )
         )

@@ -147,11 +147,11 @@ def test_other_maps_make_another_record(with_maps: Callable[..., Path], tmp_path
     before = Dataset.open(plain, tmp_path / "plain").views_record
     assert "depths_sha256" not in before.model_dump_json()
     record = Dataset.open(scene, tmp_path / "cache").views_record
-    assert before.difference(record) == "other depth maps"
+    assert before.difference(record) == "other depth maps or another known geometry"
     one = min((scene / "depths").iterdir())
     write_map(one, true_depth(scene, one.stem) * np.float32(1.01))
     changed = Dataset.open(scene, tmp_path / "cache")
-    assert record.difference(changed.views_record) == "other depth maps"
+    assert record.difference(changed.views_record) == "other depth maps or another known geometry"
     again = Dataset.open(scene, tmp_path / "fresh")
     pixels = all_pixels(changed, 0)
     np.testing.assert_array_equal(changed.known_distances(*pixels), again.known_distances(*pixels))

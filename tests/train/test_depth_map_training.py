@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 
 from octasplat.engine.core.errors import CancelledError
-from octasplat.engine.core.events import CheckpointWritten, Event
+from octasplat.engine.core.events import CheckpointWritten, Event, Warned
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.files import read_scene
 from octasplat.engine.pipeline import BlockRequest, reconstruct
@@ -120,6 +120,19 @@ def test_maps_make_the_geometry_right(plain_scene: Path, measured_scene: Path, t
     errors = [depth_error(measured_scene, run, tmp_path / "cache") for run in (plain, measured)]
     assert errors[1] < 0.5 * errors[0]
     assert errors[1] < 0.03
+
+
+def test_known_geometry_makes_the_geometry_right(
+    plain_scene: Path, measured_scene: Path, tmp_path: Path
+) -> None:
+    scene = tmp_path / "scene"
+    shutil.copytree(plain_scene, scene)
+    shutil.copy(scene / "ground_truth" / "mesh.ply", scene / "geometry.ply")
+    events: list[Event] = []
+    run = reconstruct(scene, tmp_path / "run", make_config(), progress=events.append)
+    assert depth_error(measured_scene, run, tmp_path / "cache") < 0.03
+    told = [event.message for event in events if isinstance(event, Warned)]
+    assert any("geometry.ply is taken as known geometry; 16 photographs see it" in text for text in told)
 
 
 def without_points(model: Path) -> None:
