@@ -19,7 +19,6 @@ from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.dataset.camera import Camera
 from octasplat.engine.dataset.model import PosedView
 from octasplat.engine.geometry.imported_mesh import ImportedMesh
-from octasplat.engine.trace.triangle_bvh import TriangleBvh
 
 MAX_SIDE_PX = 800
 """Longer side of the depth maps; a ray of the training takes the depth of the pixel that it falls into."""
@@ -61,6 +60,8 @@ class GeometryDepths:
     """
 
     def __init__(self, mesh: ImportedMesh, threads: int = 0) -> None:
+        from octasplat.engine.trace.triangle_bvh import TriangleBvh  # here: most scenes have no geometry
+
         vertices, faces = mesh.vertices, mesh.triangles
         self._cloud: PointCloud | None = None
         if len(faces) == 0:

@@ -18,8 +18,8 @@ from octasplat.engine.dataset.scene_split import SplitRule
 from octasplat.engine.dataset.view_frusta import ViewFrusta
 from octasplat.engine.dataset.views_file import SplitViewpoints, ViewsRecord, read_views, scene_viewpoints
 from octasplat.engine.files import read_metadata
-from octasplat.engine.files.geometry_file import find_known_geometry
 from octasplat.engine.runs.config import ReconstructionConfig, read_config
+from octasplat.engine.runs.geometry_file import find_known_geometry
 from octasplat.engine.shading.exposure import ExposuresByName
 from octasplat.engine.train.config import min_tile_side_px
 

@@ -16,8 +16,8 @@ from octasplat.engine.dataset.known_geometry import GeometryDepths, thin_points
 from octasplat.engine.dataset.load import load_dataset_model
 from octasplat.engine.dataset.model import PosedView
 from octasplat.engine.files import read_mesh
-from octasplat.engine.files.geometry_file import find_known_geometry, read_geometry
 from octasplat.engine.geometry.imported_mesh import ImportedMesh
+from octasplat.engine.runs.geometry_file import find_known_geometry, read_geometry
 from tests.support.tiny_dataset import make_tiny_dataset
 
 CAMERA = Camera("PINHOLE", (80.0, 80.0, 40.0, 30.0), 80, 60)
