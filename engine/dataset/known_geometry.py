@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.dataset.camera import Camera
@@ -22,8 +22,10 @@ from octasplat.engine.geometry.imported_mesh import ImportedMesh
 
 MAX_SIDE_PX = 800
 """Longer side of the depth maps; a ray of the training takes the depth of the pixel that it falls into."""
-MAX_POINTS = 2_000_000
+MAX_POINTS = 1_000_000
 """Of more points, one in each cell of a grid is kept."""
+POINTS_AT_ONCE = 1 << 16
+"""So many get their planes at once, to take little memory."""
 NEIGHBOURS = 8
 """So many nearest points give the plane of a point's square."""
 SPACING_NEIGHBOUR = 4
@@ -89,7 +91,7 @@ class GeometryDepths:
         if self._cloud is not None:
             reach = hits.distances[known, None].astype(np.float64)
             met_world = view.origin_world + reach * rays.directions_world[known]
-            known[known] = self._cloud.is_near_point(met_world)
+            known[known] = self._cloud.is_near_point(met_world, hits.faces[known])
         z = np.zeros(len(rays))
         z[known] = hits.distances[known] * directions[known, 2]
         depth[is_ray] = np.maximum(z, 0.0)
@@ -138,9 +140,8 @@ class PointCloud:
         from scipy.spatial import cKDTree
 
         count = min(len(points_world), NEIGHBOURS + 1)
-        self._points, self._workers = points_world, threads or -1
-        self._tree = cKDTree(points_world)
-        distances, near = self._tree.query(points_world, count, workers=self._workers)
+        self._points = points_world
+        distances, near = cKDTree(points_world).query(points_world, count, workers=threads or -1)
         shape = len(points_world), count
         spacing = distances.reshape(shape)[:, min(SPACING_NEIGHBOUR, count - 1)]
         self._spacing = np.minimum(spacing, MAX_SPACING * np.median(spacing))
@@ -148,23 +149,29 @@ class PointCloud:
 
     def squares(self) -> tuple[Float64[np.ndarray, "v 3"], Int64[np.ndarray, "f 3"]]:
         """Return a square on each point, in the plane of its neighbours, as corners and triangles."""
-        around = self._points[self._neighbours]
-        around = around - around.mean(axis=1, keepdims=True)
-        # ascending eigenvalues: the first axis is the normal, the others span the plane
-        axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))[1]
-        along = HALF_SIDE * self._spacing[:, None, None] * axes[:, :, 1:].transpose(0, 2, 1)
-        corners = np.stack(
-            [
-                self._points + sign_u * along[:, 0] + sign_v * along[:, 1]
-                for sign_u, sign_v in ((-1, -1), (1, -1), (1, 1), (-1, 1))
-            ],
-            axis=1,
-        )
+        corners = np.empty((len(self._points), 4, 3))
+        for start in range(0, len(self._points), POINTS_AT_ONCE):
+            part = slice(start, start + POINTS_AT_ONCE)
+            around = self._points[self._neighbours[part]]
+            around = around - around.mean(axis=1, keepdims=True)
+            # ascending eigenvalues: the first axis is the normal, the others span the plane
+            axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))[1]
+            along = HALF_SIDE * self._spacing[part, None, None] * axes[:, :, 1:].transpose(0, 2, 1)
+            for corner, (sign_u, sign_v) in enumerate(((-1, -1), (1, -1), (1, 1), (-1, 1))):
+                corners[part, corner] = self._points[part] + sign_u * along[:, 0] + sign_v * along[:, 1]
         first = 4 * np.arange(len(self._points), dtype=np.int64)[:, None, None]
         faces = first + np.array([[0, 1, 2], [0, 2, 3]])
         return corners.reshape(-1, 3), faces.reshape(-1, 3)
 
-    def is_near_point(self, positions_world: Float64[np.ndarray, "r 3"]) -> Bool[np.ndarray, " r"]:
-        """Return whether each position of a square is close to a point of the cloud."""
-        away, nearest = self._tree.query(positions_world, workers=self._workers)
-        return np.asarray(away <= KNOWN_RADIUS * self._spacing[nearest])
+    def is_near_point(
+        self, positions_world: Float64[np.ndarray, "r 3"], faces: Int32[np.ndarray, " r"]
+    ) -> Bool[np.ndarray, " r"]:
+        """Return whether each position, on the square of such a face, is close to a point of the cloud."""
+        is_near = np.zeros(len(faces), np.bool_)
+        for start in range(0, len(faces), POINTS_AT_ONCE):
+            part = slice(start, start + POINTS_AT_ONCE)
+            # a square reaches over the points around its own, and no farther
+            near = self._neighbours[faces[part] // 2]
+            away = np.linalg.norm(positions_world[part, None] - self._points[near], axis=2)
+            is_near[part] = (away <= KNOWN_RADIUS * self._spacing[near]).any(axis=1)
+        return is_near
