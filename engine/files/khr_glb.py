@@ -35,6 +35,8 @@ from octasplat.engine.files.glb_place import root_place
 from octasplat.engine.files.octagon_glb_reader import octagon_q, read_octagons
 from octasplat.engine.files.registry import Exporter, Importer, register
 from octasplat.engine.files.splat_rows import check_scales, iterate_blocks, select_for_export
+from octasplat.engine.files.spz import decode
+from octasplat.engine.files.spz_container import parse_spz
 from octasplat.engine.gaussians.channels import Channels, merge_widths
 from octasplat.engine.gaussians.flattening import GaussianCloud
 from octasplat.engine.gaussians.frames import quaternions_from_matrices, rotation_matrices
@@ -44,6 +46,8 @@ from octasplat.engine.gaussians.scene_metadata import SceneMetadata
 from octasplat.engine.gaussians.spherical_harmonics import rotate_sh
 
 EXTENSION = "KHR_gaussian_splatting"
+COMPRESSION = "KHR_gaussian_splatting_compression_spz_2"
+"""Within the former: all attributes are those of an SPZ, in the frame of the primitive."""
 COLOR_SPACE = "srgb_rec709_display"
 SIMILARITY_TOLERANCE = 1e-4
 """Relative error up to which a node may fail to be a rotation with one scale."""
@@ -68,11 +72,8 @@ def read(path: Path, channels: ChannelChoice = "own") -> GaussianCloud:
             splats = primitive.get("extensions", {}).get(EXTENSION)
             if splats is None:
                 continue
-            if splats.get("extensions"):
-                names = ", ".join(splats["extensions"])
-                raise SceneFileError(f"{path}: its splats need {names}, which is not read.")
             attributes = primitive["attributes"]
-            cloud = _to_world(path, _read_cloud(file, attributes, splats), file.about_origin(matrix))
+            cloud = _to_world(path, _read_cloud(path, file, attributes, splats), file.about_origin(matrix))
             columns = {name[1:].lower(): number for name, number in attributes.items() if name[0] == "_"}
             requested = select_channel_columns(path, declared, columns, channels)
             named = Channels({name: _read_channel(file, columns, own) for name, own in requested.items()})
@@ -97,8 +98,15 @@ def _read_channel(
     return np.concatenate([file.array(attributes[column], np.float32) for column in columns], axis=1)
 
 
-def _read_cloud(file: GlbFile, attributes: dict[str, int], splats: dict[str, Any]) -> GaussianCloud:
+def _read_cloud(
+    path: Path, file: GlbFile, attributes: dict[str, int], splats: dict[str, Any]
+) -> GaussianCloud:
     """Return the Gaussians of a primitive, in its own frame."""
+    further = splats.get("extensions", {})
+    if unknown := ", ".join(name for name in further if name != COMPRESSION):
+        raise SceneFileError(f"{path}: its splats need {unknown}, which is not read.")
+    if further:
+        return decode(path, parse_spz(path, file.view_bytes(further[COMPRESSION]["bufferView"])))
     xyzw = file.array(attributes[f"{EXTENSION}:ROTATION"], np.float32)
     sh = _read_harmonics(file, attributes)
     notes: tuple[str, ...] = ()
@@ -167,6 +175,7 @@ def _apply_node_transform(
         means_world=means.astype(np.float32),
         quats_wxyz=quaternions_from_matrices(frames).astype(np.float32),
         log_scales=(cloud.log_scales + np.log(scale)).astype(np.float32),
+        min_log_scale=cloud.min_log_scale + float(np.log(scale)),
         sh=rotate_sh(cloud.sh, turns),
     )
 
@@ -309,14 +318,7 @@ def _gltf_json(
     primitive = {
         "attributes": {attribute.semantic: number for number, attribute in enumerate(layout)},
         "mode": glb_container.POINTS,
-        "extensions": {
-            EXTENSION: {
-                "kernel": "ellipse",
-                "colorSpace": COLOR_SPACE,
-                "projection": "perspective",
-                "sortingMethod": "cameraDistance",
-            }
-        },
+        "extensions": {EXTENSION: splats_json()},
     }
     extras = glb_container.channel_extras(scene.channels.widths)
     return {
@@ -329,6 +331,16 @@ def _gltf_json(
         "accessors": accessors,
         "bufferViews": views,
         "buffers": [{"byteLength": offset}],
+    }
+
+
+def splats_json() -> dict[str, object]:
+    """Return what a primitive says of its splats."""
+    return {
+        "kernel": "ellipse",
+        "colorSpace": COLOR_SPACE,
+        "projection": "perspective",
+        "sortingMethod": "cameraDistance",
     }
 
 

@@ -15,6 +15,7 @@ from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.format_table import Entry, FormatTable
 from octasplat.engine.gaussians.flattening import GaussianCloud
 from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.scene_metadata import SceneMetadata
 from octasplat.engine.geometry.imported_mesh import ImportedMesh
 from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 
@@ -66,6 +67,7 @@ class Exporter(Entry):
         holds_origin: whether it says where a scene of large coordinates has its origin, and its georeference.
         beside: names the files that are written beside the path, if there are any.
         find_losses: returns what of a scene lies beyond the ranges of the format, one sentence a loss.
+        find_place_losses: returns what the format cannot do with what is known of a scene's place, likewise.
     """
 
     noun: ClassVar[str] = "export"
@@ -77,6 +79,7 @@ class Exporter(Entry):
     holds_origin: bool = False
     beside: Callable[[Path], tuple[Path, ...]] = no_files
     find_losses: Callable[[FlatGaussians], tuple[str, ...]] = lambda _scene: ()
+    find_place_losses: Callable[[SceneMetadata], tuple[str, ...]] = lambda _facts: ()
 
 
 @dataclass(frozen=True)

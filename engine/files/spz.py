@@ -1,5 +1,6 @@
 """SPZ (Niantic), about 15 bytes a Gaussian: versions 2, 3 and 4 in, 3, which every viewer reads, or 4 out."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +29,7 @@ from octasplat.engine.files.range_losses import (
 )
 from octasplat.engine.files.registry import Exporter, Importer, register
 from octasplat.engine.files.splat_rows import iterate_blocks, select_for_export
-from octasplat.engine.files.spz_container import ANTIALIASED, GZIP_MAGIC, MAGIC, SpzFile, read_spz, write_spz
+from octasplat.engine.files.spz_container import ANTIALIASED, GZIP_MAGIC, MAGIC, SpzFile, pack_spz, read_spz
 from octasplat.engine.gaussians.flattening import FLAT_LOG_SCALE, GaussianCloud
 from octasplat.engine.gaussians.model import FlatGaussians
 
@@ -51,7 +52,21 @@ def read(path: Path) -> GaussianCloud:
     Raises:
         SceneFileError: the file is no SPZ, is damaged, or of an unknown version.
     """
-    file = read_spz(path)
+    cloud = decode(path, read_spz(path))
+    return replace(
+        cloud,
+        means_world=half_turn_points(cloud.means_world),
+        quats_wxyz=half_turn_quats(cloud.quats_wxyz),
+        sh=half_turn_sh(cloud.sh),
+    )
+
+
+def decode(path: Path, file: SpzFile) -> GaussianCloud:
+    """Return all Gaussians as they stand in a file: y up.
+
+    Raises:
+        SceneFileError: there are none.
+    """
     if file.count == 0:
         raise SceneFileError(f"{path}: holds no Gaussians.")
     positions, opacities, colors, scales, rotations, harmonics = (
@@ -66,12 +81,12 @@ def read(path: Path) -> GaussianCloud:
     if file.flags & ANTIALIASED:
         notes.append("The scene was trained with antialiasing, which is not modelled here.")
     return GaussianCloud(
-        means_world=half_turn_points(_fixed_point(positions, file.fractional_bits)),
-        quats_wxyz=half_turn_quats(quats),
+        means_world=_fixed_point(positions, file.fractional_bits),
+        quats_wxyz=quats,
         log_scales=scales.astype(np.float32) / LOG_SCALE_STEPS - LOG_SCALE_OFFSET,
         min_log_scale=-LOG_SCALE_OFFSET,
         opacity_logits=logits_from_bytes(opacities[:, 0]),
-        sh=half_turn_sh(sh),
+        sh=sh,
         notes=tuple(notes),
     )
 
@@ -108,6 +123,18 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
         OSError: the file cannot be written.
     """
     scene = select_for_export(gaussians, path, options)
+    file = encode(scene, path, options.spz_version)
+    with atomic_replace(path) as temporary:
+        temporary.write_bytes(pack_spz(file))
+    return (path,)
+
+
+def encode(scene: FlatGaussians, path: Path, version: int) -> SpzFile:
+    """Return the Gaussians in their order, turned to y up, as an SPZ of version 3 or 4.
+
+    Raises:
+        SceneFileError: positions are beyond what 24 bits hold; it names ``path``.
+    """
     if _fitting_bits(scene) < 0:
         farthest = float(np.abs(scene.means_world).max())
         raise SceneFileError(
@@ -118,18 +145,14 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     for block in iterate_blocks(scene):
         for stream, data in zip(streams, _pack_block(half_turn_gaussians(block), bits), strict=True):
             stream += data
-    packed = tuple(bytes(stream) for stream in streams)
-    file = SpzFile(
-        version=options.spz_version,
+    return SpzFile(
+        version=version,
         count=len(scene),
         sh_degree=scene.sh_degree,
         fractional_bits=bits,
         flags=0,
-        streams=packed,
+        streams=tuple(bytes(stream) for stream in streams),
     )
-    with atomic_replace(path) as temporary:
-        write_spz(temporary, file)
-    return (path,)
 
 
 def _pack_block(scene: FlatGaussians, bits: int) -> tuple[bytes, ...]:
@@ -160,12 +183,22 @@ def _fractional_bits(scene: FlatGaussians) -> int:
 def _find_losses(scene: FlatGaussians) -> tuple[str, ...]:
     if len(scene) == 0 or not scene.is_finite() or _fitting_bits(scene) < 0:
         return ()  # which is refused
+    sizes, harmonics = find_range_losses("spz", scene)
+    return (*sizes, *find_position_losses("spz", scene, 2.0 ** -_fractional_bits(scene)), *harmonics)
+
+
+def find_range_losses(format_name: str, scene: FlatGaussians) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return what bytes lose of the sizes and of the harmonics of a finite scene, in sentences.
+
+    Args:
+        format_name: of the format that has an SPZ in it.
+        scene: what is written, not empty.
+    """
     half = 0.5 / LOG_SCALE_STEPS  # what is this far out of range is still rounded to its end
     largest = 255.0 / LOG_SCALE_STEPS - LOG_SCALE_OFFSET
     return (
-        *find_size_losses("spz", scene, -LOG_SCALE_OFFSET - half, largest + half),
-        *find_position_losses("spz", scene, 2.0 ** -_fractional_bits(scene)),
-        *find_harmonic_losses("spz", scene, 1.0),
+        find_size_losses(format_name, scene, -LOG_SCALE_OFFSET - half, largest + half),
+        find_harmonic_losses(format_name, scene, 1.0),
     )
 
 

@@ -5,11 +5,11 @@ y up, z backward; harmonics beyond degree 3 are left to the caller.
 """
 
 import gzip
+import io
 import struct
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
 
 import zstandard
 
@@ -63,26 +63,41 @@ def read_spz(path: Path) -> SpzFile:
         SceneFileError: the file is no SPZ, is damaged, or is of an unknown version.
     """
     try:
-        with path.open("rb") as handle:
-            start = handle.read(len(MAGIC))
-        if start == MAGIC:
-            return _read_v4(path, path.read_bytes())
-        if start.startswith(GZIP_MAGIC):
-            return _read_gzip(path)
+        data = path.read_bytes()
+    except OSError as error:
+        raise SceneFileError(f"{path}: is damaged or cannot be read ({error}).") from error
+    return parse_spz(path, data)
+
+
+def parse_spz(path: Path, data: bytes) -> SpzFile:
+    """Decompress the content of a file.
+
+    Args:
+        path: file that it is from, for errors.
+        data: all of the SPZ.
+
+    Raises:
+        SceneFileError: it is no SPZ, is damaged, or is of an unknown version.
+    """
+    try:
+        if data.startswith(MAGIC):
+            return _read_v4(path, data)
+        if data.startswith(GZIP_MAGIC):
+            return _read_gzip(path, data)
     except (OSError, EOFError, zlib.error, zstandard.ZstdError, struct.error) as error:
         raise SceneFileError(f"{path}: is damaged or cannot be read ({error}).") from error
     raise SceneFileError(f"{path}: is no SPZ file.")
 
 
-def _read_gzip(path: Path) -> SpzFile:
-    with gzip.open(path) as handle:
+def _read_gzip(path: Path, data: bytes) -> SpzFile:
+    with gzip.open(io.BytesIO(data)) as handle:
         magic, version, count, degree, bits, flags, _ = _HEADER.unpack(handle.read(_HEADER.size))
         if magic != MAGIC:
             raise SceneFileError(f"{path}: is gzip, but holds no SPZ.")
         if version not in VERSIONS[:2]:
             raise SceneFileError(f"{path}: is SPZ version {version}; versions 2, 3 and 4 are read.")
         widths = _checked_widths(path, version, degree)
-        if count * sum(widths) > _GZIP_RATIO * path.stat().st_size:
+        if count * sum(widths) > _GZIP_RATIO * len(data):
             raise _truncated_error(path, count)
         streams = tuple(handle.read(count * width) for width in widths)
         handle.read(_MAX_EXTENSIONS)  # the end of the stream is where its checksum is looked at
@@ -136,25 +151,25 @@ def _truncated_error(path: Path, count: int) -> SceneFileError:
     return SceneFileError(f"{path}: is truncated; not all of its {count} Gaussians are there.")
 
 
-def write_spz(path: Path, file: SpzFile) -> None:
-    """Write a file: gzip for version 3, Zstandard for version 4."""
-    with path.open("wb") as handle:
-        if file.version == VERSIONS[-1]:
-            _write_v4(handle, file)
-            return
-        header = (file.version, file.count, file.sh_degree, file.fractional_bits, file.flags, 0)
-        # Without the time, equal scenes give equal files.
-        with gzip.GzipFile("", "wb", GZIP_LEVEL, handle, mtime=0) as packed:
-            packed.write(_HEADER.pack(MAGIC, *header))
-            for stream in file.streams:
-                packed.write(stream)
+def pack_spz(file: SpzFile) -> bytes:
+    """Return the content of a file: gzip for version 3, Zstandard for version 4."""
+    if file.version == VERSIONS[-1]:
+        return _pack_v4(file)
+    packed = io.BytesIO()
+    header = (file.version, file.count, file.sh_degree, file.fractional_bits, file.flags, 0)
+    # Without the time, equal scenes give equal files.
+    with gzip.GzipFile("", "wb", GZIP_LEVEL, packed, mtime=0) as handle:
+        handle.write(_HEADER.pack(MAGIC, *header))
+        for stream in file.streams:
+            handle.write(stream)
+    return packed.getvalue()
 
 
-def _write_v4(handle: IO[bytes], file: SpzFile) -> None:
+def _pack_v4(file: SpzFile) -> bytes:
     streams = [stream for stream in file.streams if stream]
     packed = [zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(stream) for stream in streams]
     header = (file.version, file.count, file.sh_degree, file.fractional_bits, file.flags, len(packed))
-    handle.write(_HEADER_V4.pack(MAGIC, *header, _HEADER_V4.size))
-    for small, stream in zip(packed, streams, strict=True):
-        handle.write(_TOC_ENTRY.pack(len(small), len(stream)))
-    handle.writelines(packed)
+    contents = [
+        _TOC_ENTRY.pack(len(small), len(stream)) for small, stream in zip(packed, streams, strict=True)
+    ]
+    return b"".join([_HEADER_V4.pack(MAGIC, *header, _HEADER_V4.size), *contents, *packed])

@@ -79,6 +79,7 @@ def dropped_on_export(
             f"{facts.georeference.describe()}."
         )
     for exporter in chosen.values():
+        lines += exporter.find_place_losses(facts)
         lines += exporter.find_losses(gaussians)
     return tuple(lines)
 

@@ -20,6 +20,7 @@ DEFAULT_FILE_NAMES = {
     "spz": "scene.spz",
     "sog": "scene.sog",
     "streamed-sog": "lod-meta.json",
+    "3d-tiles": "tileset.json",
     "splat": "scene.splat",
     "khr-glb": "scene.splats.glb",
     "usd": "scene.usdz",

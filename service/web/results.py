@@ -3,6 +3,7 @@
 import json
 import logging
 import math
+import re
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -225,12 +226,15 @@ def download_groups(artifacts: Sequence[Artifact]) -> list[DownloadGroup]:
 
 
 _SCENE, _FIGURES, _IMAGES, _RECORDS = "Scene and meshes", "Report and figures", "Images", "Records of the run"
-_GROUPS = {_SCENE: False, _FIGURES: False, _IMAGES: True, _RECORDS: True}
+_PARTS = "Parts of levels of detail"
+_GROUPS = {_SCENE: False, _FIGURES: False, _IMAGES: True, _PARTS: True, _RECORDS: True}
 _USE_BY_NAME = {
     SCENE: (_SCENE, "SuperSplat, PlayCanvas, Spark, Unity and Unreal splat plug-ins; octasplat itself"),
     **{name: (_SCENE, file.opens_in) for file in RESULT_FILES for name in file.names},
     "octagons_alpha.png": (_SCENE, "the texture that octagons.obj uses"),
     "mesh_alpha.png": (_SCENE, "the texture that mesh.obj uses"),
+    "lod-meta.json": (_SCENE, "the PlayCanvas engine, with the folders of its chunks"),
+    "tileset.json": (_SCENE, "CesiumJS, with the folder of its tiles"),
     METRICS: (_FIGURES, "any program that reads JSON"),
     REPORT: (_FIGURES, "a browser; one file, to keep or to send"),
     CONFIG: (_RECORDS, "a text editor: every setting of the run"),
@@ -267,6 +271,8 @@ _USE_BY_SUFFIX = {
     ".bin": (_RECORDS, "COLMAP"),
     ".txt": (_RECORDS, "COLMAP or a text editor"),
 }
+_TILE = re.compile(r"tiles/\d+_\d+\.glb")
+_CHUNK_FILE = re.compile(r"\d+_\d+/[^/]+")
 _USE_OTHER = (_RECORDS, "a text editor")
 
 
@@ -275,6 +281,10 @@ def _group_and_use(name: str) -> tuple[str, str]:
     if name in _USE_BY_NAME:
         return _USE_BY_NAME[name]
     # Before the suffix, which meshes have too.
+    if _TILE.fullmatch(name):
+        return _PARTS, "goes with tileset.json, in the folder of its name"
+    if _CHUNK_FILE.fullmatch(name):
+        return _PARTS, "goes with lod-meta.json, in the folder of its name"
     if _holds_splats(name):
         return _SCENE, "three.js, PlayCanvas, Babylon.js: Gaussians by KHR_gaussian_splatting"
     if lower.endswith(("mesh.ply", OCTAGONS_PLY.name)):
@@ -283,7 +293,8 @@ def _group_and_use(name: str) -> tuple[str, str]:
 
 
 def _holds_splats(name: str) -> bool:
-    return name.lower().endswith((".splats.glb", "_splats.glb", "-splats.glb"))
+    is_named_so = name.lower().endswith((".splats.glb", "_splats.glb", "-splats.glb"))
+    return is_named_so or _TILE.fullmatch(name) is not None
 
 
 def _sort_rank(name: str) -> int:

@@ -13,7 +13,7 @@ test_reconstruct_without_poses.py test_worker_recovery.py test_tracers.py test_g
 test_event_loop.py test_renders_on_small_disks.py test_half_open_connections.py
 test_jobs_without_poses.py test_pipeline_resume.py test_partial_results.py test_dataset.py
 test_finite_differences.py test_full_disk.py test_requeued_position.py test_job_limits.py
-test_start_refused.py test_splat_transform.py test_threejs.py test_fusion.py test_lost_locks.py
+test_start_refused.py test_splat_transform.py test_cesium.py test_threejs.py test_fusion.py test_lost_locks.py
 test_spark.py test_demo.py test_surface.py test_exposure.py test_presets.py test_isolation.py
 test_eviction.py test_lights.py test_viewer.py test_threads.py test_front_end_imports.py
 test_against_mitsuba.py test_custom_shading_model.py test_brute_force.py test_dense_points.py

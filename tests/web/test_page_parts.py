@@ -9,7 +9,7 @@ import uuid
 import pytest
 
 from octasplat.service.web import formatting
-from octasplat.service.web.results import download_groups, read_measurements
+from octasplat.service.web.results import download_groups, read_measurements, viewable_mesh
 from octasplat.service.web.routing import safe_local_path
 from octasplat.workers.db.connections import open_pool
 from octasplat.workers.db.events_and_logs import add_event
@@ -207,6 +207,16 @@ def test_downloads_name_programs_that_open_them() -> None:
     assert "haze" in found["mesh.glb"] and found["mesh.glb"] == found["octagons.glb"]
     assert groups[0].files[0].name == "scene.ply"
     assert [group.title for group in groups if group.folded] == ["Images", "Records of the run"]
+
+
+def test_tiles_are_parts_of_what_opens_them_and_no_meshes() -> None:
+    rows = [artifact(name) for name in ("tileset.json", "tiles/0_0.glb", "lod-meta.json", "0_0/meta.json")]
+    groups = {group.title: [file.name for file in group.files] for group in download_groups(rows)}
+    assert groups == {
+        "Scene and meshes": ["lod-meta.json", "tileset.json"],
+        "Parts of levels of detail": ["0_0/meta.json", "tiles/0_0.glb"],
+    }
+    assert viewable_mesh(rows) is None
 
 
 def test_views_are_worst_first_and_odd_figures_do_no_harm() -> None:
