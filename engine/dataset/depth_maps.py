@@ -282,9 +282,9 @@ def check_geometry(
     if seeing == 0 and maps.are_of_geometry.any():
         raise DatasetError(f"{geometry.path} is seen by none of the photographs: {way_out}")
     ratios = _depth_ratios(maps, model, views[maps.are_of_geometry[views]])
-    told = f"{geometry.path.name} is taken as known geometry; {seeing} photographs see it"
+    sentence = f"{geometry.path.name} is taken as known geometry; {seeing} photographs see it"
     if len(ratios) < MIN_POINTS:
-        return f"{told}, and too few sparse points lie on it to show whether it stands right."
+        return f"{sentence}, and too few sparse points lie on it to show whether it stands right."
     share = float((np.abs(ratios - 1) < GEOMETRY_TOLERANCE).mean())
     if share < MIN_AGREEING:
         raise DatasetError(
@@ -292,7 +292,7 @@ def check_geometry(
             f"{100 * share:.0f} % lie within {100 * GEOMETRY_TOLERANCE:.0f} % of its depth: {way_out}"
         )
     return (
-        f"{told}, and {100 * share:.0f} % of {len(ratios)} sparse points lie within "
+        f"{sentence}, and {100 * share:.0f} % of {len(ratios)} sparse points lie within "
         f"{100 * GEOMETRY_TOLERANCE:.0f} % of its depth."
     )
 

@@ -131,8 +131,8 @@ def test_known_geometry_makes_the_geometry_right(
     events: list[Event] = []
     run = reconstruct(scene, tmp_path / "run", make_config(), progress=events.append)
     assert depth_error(measured_scene, run, tmp_path / "cache") < 0.03
-    told = [event.message for event in events if isinstance(event, Warned)]
-    assert any("geometry.ply is taken as known geometry; 16 photographs see it" in text for text in told)
+    messages = [event.message for event in events if isinstance(event, Warned)]
+    assert any("geometry.ply is taken as known geometry; 16 photographs see it" in text for text in messages)
 
 
 def without_points(model: Path) -> None:
