@@ -13,6 +13,7 @@ from octasplat.engine.settings.renamed_settings import collect_notices
 from octasplat.service.actions.access import check_not_draining, fetch_visible_job
 from octasplat.service.actions.jobs import job_view
 from octasplat.service.actions.named_files import check_named_files
+from octasplat.service.actions.start_sources import fetch_start_source, lacks_source, options_with_start
 from octasplat.service.actions.validation import (
     ResolvedOptions,
     input_problem,
@@ -254,14 +255,24 @@ async def _check_files(connection: Connection, principal: Principal, requested: 
 async def _check_dataset(
     connection: Connection, principal: Principal, requested: _RequestedJob
 ) -> _JobInputs:
-    new, kind = requested.new, requested.kind
-    if new.dataset_id is None or new.source_id is not None:
+    new, kind, options = requested.new, requested.kind, requested.options
+    source, dataset_id = None, new.dataset_id
+    if kind.may_start_from_result and new.source_id is not None:
+        source = await fetch_start_source(connection, principal, kind, new.source_id)
+        options, dataset_id = options_with_start(kind, options), dataset_id or source.dataset_id
+        if dataset_id is None:
+            detail = "The photographs of the job in source_id were deleted; name some as dataset_id."
+            raise input_problem("dataset_id", detail)
+    elif kind.starts_from_result(options):
+        raise input_problem("source_id", "The options are of a job that begins with another; name source_id.")
+    elif dataset_id is None or new.source_id is not None:
         raise input_problem("dataset_id", f"A job of the kind {kind.name} works on dataset_id, a dataset.")
-    dataset = await _get_photographs(connection, principal, new.dataset_id)
-    if kind.needs_poses(requested.options) and not dataset.has_poses:
+    dataset = await _get_photographs(connection, principal, dataset_id)
+    if kind.needs_poses(options) and not dataset.has_poses:
         detail = "The dataset holds no COLMAP model; set the option poses to auto, or send a model."
         raise ProblemError(422, "poses", detail, errors=[{"pointer": "#/options/poses", "detail": detail}])
-    return _JobInputs(dataset.id, None, kind.with_poses_known(requested.options, dataset.has_poses))
+    source_id = None if source is None else source.id
+    return _JobInputs(dataset.id, source_id, kind.with_poses_known(options, dataset.has_poses))
 
 
 async def _get_photographs(connection: Connection, principal: Principal, dataset_id: uuid.UUID) -> Dataset:
@@ -291,9 +302,9 @@ async def _revised_options(
             return None
         detail = "The job is of another version, so its options cannot be changed; make a new one."
         raise ProblemError(409, "version", detail) from None
-    if kind.needs == "result" and job.source_id is None:
-        raise ProblemError(409, "source", "The job whose results it works on was deleted; make a new job.")
     is_resumed = request.start == "checkpoint" and job.checkpoint is not None
+    if lacks_source(kind, before, job, is_resumed=is_resumed):
+        raise ProblemError(409, "source", "The job whose results it works on was deleted; make a new job.")
     revised = ResolvedOptions(before, job.requested)
     if request.options:
         revised = await revise_options(kind, revised, request.options, is_resumed=is_resumed)

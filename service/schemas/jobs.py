@@ -23,6 +23,7 @@ class NewJob(RequestBody):
         json_schema_extra={
             "examples": [
                 {"dataset_id": EXAMPLE_ID, "options": {"preset": "fast"}},
+                {"source_id": EXAMPLE_ID, "options": {"preset": "high"}},
                 {"kind": "export", "source_id": EXAMPLE_ID, "options": {"files": ["scene.glb"]}},
                 {
                     "kind": "render",
@@ -46,7 +47,11 @@ class NewJob(RequestBody):
         description="A committed dataset, for kinds that need one; `evaluate` measures its photographs "
         "in the place of those that the job in `source_id` held out.",
     )
-    source_id: uuid.UUID | None = Field(None, description="A job that succeeded, for kinds that work on one.")
+    source_id: uuid.UUID | None = Field(
+        None,
+        description="A job that succeeded, for kinds that work on one; `reconstruct` begins with the "
+        "Gaussians of a reconstruction, finished or stopped, and without `dataset_id` takes its photographs.",
+    )
     files_id: uuid.UUID | None = Field(
         None,
         description="A committed dataset that holds the files which the options name; kinds that work on "

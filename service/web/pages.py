@@ -15,6 +15,7 @@ from octasplat.engine.settings.preset_names import PRESET_WORDS
 from octasplat.service.actions import jobs as actions
 from octasplat.service.actions.artifacts import find_live_scene, get_artifact, list_artifacts
 from octasplat.service.actions.datasets import list_datasets
+from octasplat.service.actions.start_sources import may_be_begun_with
 from octasplat.service.actions.submission import retry_job
 from octasplat.service.actions.system import list_live_workers
 from octasplat.service.auth import Principal, Reader, Writer
@@ -171,7 +172,8 @@ async def show_new(
     like: uuid.UUID | None = None,
 ) -> Response:
     """Return the page that uploads photographs and queues their reconstruction, perhaps like another job."""
-    earlier = None if like is None else (await actions.get_job(service, principal, like)).view
+    found = None if like is None else await actions.get_job(service, principal, like)
+    earlier = None if found is None else found.view
     kind = get_job_kind("reconstruct")
     datasets = await list_datasets(service, principal, limit=MAX_DATASETS)
     workers = await list_live_workers(service)
@@ -185,6 +187,7 @@ async def show_new(
         datasets=[row for row in datasets.rows if row.state == "committed" and row.holds == "photographs"],
         chosen=dataset or (earlier.dataset_id if earlier else None),
         earlier=earlier,
+        may_begin_with=found is not None and await may_be_begun_with(service, kind, found.row),
         queues=sorted({"cpu", *(queue for worker in workers for queue in worker.queues)} - {""}),
         max_file_bytes=service.settings.max_upload_bytes,
     )

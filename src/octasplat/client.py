@@ -70,8 +70,9 @@ class Client:
 
     def submit(
         self,
-        photographs: PathLike,
+        photographs: PathLike | None = None,
         *,
+        start_from: "Job | str | None" = None,
         label: str | None = None,
         queue: str = "cpu",
         priority: int = 0,
@@ -82,7 +83,9 @@ class Client:
 
         Args:
             photographs: a folder, a ZIP file, the id of a dataset, or the https address of a ZIP file, which
-                the service fetches.
+                the service fetches; None takes those of ``start_from``.
+            start_from: a reconstruction, finished or stopped, or its id: with its Gaussians the new one
+                begins.
             label: what to call the job.
             queue: which workers.
             priority: higher goes first.
@@ -94,7 +97,9 @@ class Client:
             ServiceError: the service refuses the photographs or the options.
             ServiceUnreachableError: nobody answers.
         """
-        what = Submission(_scene(photographs), options, label, queue, priority)
+        scene = None if photographs is None else _scene(photographs)
+        source = start_from.id if isinstance(start_from, Job) else start_from
+        what = Submission(scene, options, label, queue, priority, start_from=source)
         return Job(self._api, submission.submit(self._api, what, progress or default_progress()))
 
     def derive(

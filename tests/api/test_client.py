@@ -78,6 +78,10 @@ def test_client_submit_and_download_round_trip(service: Service, photographs: Pa
         assert len(derived.download(tmp_path / "views")) >= 2
         assert client.job(derived.id).kind == "render"
 
+        next_one = client.submit(start_from=job, preset="fast").cancel()
+        assert next_one.content["source_id"] == job.id
+        assert next_one.content["dataset_id"] == job.content["dataset_id"]
+
 
 def test_refused_request_raises_service_error(service: Service, photographs: Path) -> None:
     with osp.Client(service.url, service.token) as client:
@@ -89,6 +93,8 @@ def test_refused_request_raises_service_error(service: Service, photographs: Pat
         with pytest.raises(JobFailedError, match="cancelled"):
             job.wait()
         assert job.state == "canceled"
+        with pytest.raises(ServiceError, match="neither a scene nor a checkpoint"):
+            client.submit(start_from=job)
     with (
         osp.Client(service.url, "not-a-token") as stranger,
         pytest.raises(ServiceError, match="OCTASPLAT_TOKEN"),

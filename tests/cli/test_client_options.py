@@ -55,6 +55,20 @@ def test_assignments_win_over_the_files_of_a_stage_and_a_path(tmp_path) -> None:
     assert options["camera_path"]["fps"] == 7 and options["camera_path"]["width"] == 32
 
 
+def test_submit_names_the_job_that_it_begins_with(octasplat, asked: list[dict]) -> None:
+    done = octasplat("submit", "--start-from", JOB["id"], "--preset", "high")
+    assert done.exit_code == 0, done.output
+    dataset = "01999999-0000-7000-8000-000000000815"
+    done = octasplat("submit", dataset, "--start-from", JOB["id"])
+    assert done.exit_code == 0, done.output
+    first, second = asked
+    assert first["source_id"] == second["source_id"] == JOB["id"]
+    assert first["options"] == {"preset": "high"} and "dataset_id" not in first
+    assert second["dataset_id"] == dataset
+    refused = octasplat("submit", "--preset", "high")
+    assert refused.exit_code == 2 and "--start-from" in refused.stderr and len(asked) == 2
+
+
 @pytest.mark.parametrize("command", [("submit", "photos"), ("derive", "render", JOB["id"])])
 def test_output_folder_requires_wait(octasplat, asked: list[dict], command) -> None:
     refused = octasplat(*command, "-o", "out")

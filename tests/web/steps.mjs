@@ -336,6 +336,21 @@ const steps = {
         return found;
     },
 
+    /** A job like another one begins with its Gaussians. */
+    async begin() {
+        const found = {};
+        const page = await open();
+        await page.goto(`${job.url}/new?like=${job.job}`);
+        found.words = (await page.locator("label", { has: page.locator("#begin-with") }).textContent()).trim();
+        await page.check("#begin-with");
+        await page.click("#start");
+        await page.waitForURL(`${job.url}/jobs/*`);
+        found.job = page.url().split("/").at(-1);
+        found.source = await page.textContent(".source");
+        found.faults = await portray(`/new?like=${job.job}`, "begin");
+        return found;
+    },
+
     /** A job that was cancelled goes on with other files to write. */
     async goOn() {
         const page = await open();

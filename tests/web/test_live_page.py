@@ -186,3 +186,19 @@ def test_cancelled_job_goes_on_with_other_files(
     assert found["complaints"] == []
     revised = service.request("GET", f"/v1/jobs/{job}")
     assert revised["state"] == "queued" and "scene.spz" in revised["options"]["exports"]
+
+
+def test_box_on_the_form_begins_with_the_gaussians_of_a_job(
+    service: RunningService, browse: Browse, folder: Path, job: uuid.UUID, axe: str
+) -> None:
+    dataset = service.request("GET", f"/v1/jobs/{job}")["dataset_id"]
+    body = {"dataset_id": dataset, "options": {"preset": "fast", "max_side": 64}, "queue": "nobody"}
+    result = service.request("POST", "/v1/jobs", body)["id"]
+    service.worker.run(uuid.UUID(result), folder / "run")
+    found = browse("begin", service.url, job=result, axe=axe)
+    assert found["complaints"] == [] and found["faults"] == []
+    assert found["words"] == "Begin with the Gaussians of this job"
+    assert found["source"] == "The job that this one begins with"
+    queued = service.request("GET", f"/v1/jobs/{found['job']}")
+    assert (queued["source_id"], queued["dataset_id"]) == (result, dataset)
+    assert queued["options"]["max_side"] == 64

@@ -10,12 +10,10 @@ import pytest
 
 from octasplat.engine.pipeline import BlockRequest, reconstruct
 from octasplat.engine.runs.config import resolve_config
-from octasplat.workers.db.connections import Connection
-from octasplat.workers.db.datasets import NewFile, create_dataset, put_files
-from octasplat.workers.db.locks import lock_owner
 from octasplat.workers.db.rows import Job
 from octasplat.workers.queue.block_jobs import blocks_of
 from octasplat.workers.storage.factory import open_storage
+from tests.support.stored_dataset import store_dataset
 from tests.support.tiny_dataset import make_tiny_dataset
 from tests.support.worker_harness import WorkerHarness
 
@@ -50,28 +48,6 @@ def one_process(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     config = resolve_config(assignments=[f"{name}={json.dumps(value)}" for name, value in given.items()])
     output = tmp_path_factory.mktemp("whole") / "run"
     return reconstruct(scene, output, config, threads=1, blocks=BlockRequest(count=2))
-
-
-def store_dataset(bench: WorkerHarness, scene: Path) -> uuid.UUID:
-    """Put the photographs into the store and the tables."""
-    (bench.folder / "store").mkdir(exist_ok=True)
-    storage = open_storage(bench.folder / "store")
-
-    async def store(connection: Connection) -> uuid.UUID:
-        await lock_owner(connection, "me")
-        dataset = await create_dataset(connection, owner="me", name="tiny")
-        files = []
-        for path in sorted(path for path in scene.rglob("*") if path.is_file()):
-            with storage.open_writer() as writer:
-                writer.write(path.read_bytes())
-                blob = writer.commit()
-            files.append(NewFile(path.relative_to(scene).as_posix(), blob.sha256, path.stat().st_size))
-        await put_files(connection, dataset.id, files)
-        await connection.execute("UPDATE datasets SET state = 'committed', has_poses = true")
-        return dataset.id
-
-    found: uuid.UUID = bench.run_query(store)
-    return found
 
 
 def submit(bench: WorkerHarness, scene: Path, **options: Any) -> uuid.UUID:

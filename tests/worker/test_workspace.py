@@ -15,6 +15,7 @@ from octasplat.workers.storage.errors import StorageFullError, StorageUnavailabl
 from octasplat.workers.storage.local import LocalStorage
 from octasplat.workers.storage.trees import TreeFile
 from octasplat.workers.worker import workspace_locks
+from octasplat.workers.worker.path_redaction import PathRedactor
 from octasplat.workers.worker.stored_frames import StoredFrames
 from octasplat.workers.worker.task import FRAMES_FOLDER, RUN_FOLDER
 from octasplat.workers.worker.workspace import Workspace
@@ -81,3 +82,15 @@ def test_sweep_goes_on_after_folder_that_its_worker_removes(
     monkeypatch.setattr(workspace_locks, "open_locked", open_locked)
     assert sweep_workspaces(tmp_path) == 2
     assert list((tmp_path / "attempts").iterdir()) == []
+
+
+def test_sentences_of_earlier_attempts_name_no_folder(tmp_path: Path) -> None:
+    job, source = uuid.uuid4(), uuid.uuid4()
+    redactor = PathRedactor(tmp_path / "attempts" / f"{job}.2", tmp_path)
+    for work in (tmp_path, Path("/of/another/machine")):
+        for attempt in (1, 2):
+            noted = f"{work}/attempts/{job}.{attempt}"
+            told = redactor.redact(
+                f"{noted}/job {source} was trained on views; {noted}/run/scene.ply is large"
+            )
+            assert told == f"job {source} was trained on views; scene.ply is large"

@@ -32,20 +32,23 @@ class Submission:
     """Description of a job to submit.
 
     Attributes:
-        scene: folder of photographs, ZIP file, the id of a dataset, or the address of a ZIP file, as text.
+        scene: folder of photographs, ZIP file, the id of a dataset, or the address of a ZIP file, as text;
+            None takes the photographs of ``start_from``.
         options: of the reconstruction.
         label: what to call the job.
         queue: which workers.
         priority: higher goes first.
         sha256: what the ZIP file at an address must be.
+        start_from: the reconstruction, finished or stopped, with whose Gaussians it begins; its id.
     """
 
-    scene: Path | str
+    scene: Path | str | None
     options: Mapping[str, Any] = field(default_factory=dict)
     label: str | None = None
     queue: str = "cpu"
     priority: int = 0
     sha256: str | None = None
+    start_from: str | None = None
 
 
 def submit(api: Api, submission: Submission, on_event: EventListener = ignore_events) -> dict[str, Any]:
@@ -59,13 +62,16 @@ def submit(api: Api, submission: Submission, on_event: EventListener = ignore_ev
     Raises:
         OctasplatError: the scene or the options are refused, or the service does not answer.
     """
-    body = {
-        "dataset_id": _upload_if_needed(api, submission.scene, on_event, submission.sha256),
+    body: dict[str, Any] = {
         "options": dict(submission.options),
         "label": submission.label,
         "queue": submission.queue,
         "priority": submission.priority,
     }
+    if submission.start_from is not None:
+        body["source_id"] = submission.start_from
+    if submission.scene is not None:
+        body["dataset_id"] = _upload_if_needed(api, submission.scene, on_event, submission.sha256)
     job: dict[str, Any] = api.post("/v1/jobs", body)
     return job
 

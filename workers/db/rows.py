@@ -72,7 +72,7 @@ class Job:
         owner: whose it is.
         kind: name in the table of job kinds.
         dataset_id: what it works on.
-        source_id: the finished job whose results it works on.
+        source_id: the finished job whose results it works on, or a job that is over with which it begins.
         label: what its owner calls it.
         requested: the options as they were asked for, which the version that runs the job completes; None
             where a front end of the last version queued it.

@@ -88,6 +88,7 @@ def _run_task(task: dict[str, Any], events: _EventStream, stop: threading.Event)
                 progress=report,
                 should_stop=stop.is_set,
                 kind=task.get("kind", ""),
+                begins_with=Path(task["begins_with"]) if task.get("begins_with") else None,
             )
         )
     except CancelledError as error:

@@ -15,6 +15,11 @@ from octasplat.workers.worker.task import RUN_FOLDER
 # A path begins where no word, address or other path goes on.
 _ABSOLUTE = re.compile(r"""(?<![\w.~/…])(?!(?<=:)//)(?:/+[^\s/"'`:;,()<>|\[\]{}]+)+/?""")
 _KEPT_PATH_PARTS = 2
+_OTHER_ATTEMPT = (
+    r"""(?<![^\s"'(=])(?:/[^\s/"'(=]+)+/attempts/[0-9a-f]{8}-[0-9a-f-]{27}\.\d+/"""
+    rf"(?:{RUN_FOLDER}/)?"
+)
+"""The folder of an attempt, see :class:`octasplat.workers.worker.workspace.Workspace`, and its run."""
 
 
 class PathRedactor:
@@ -36,6 +41,8 @@ class PathRedactor:
                 (rf"{root}/", ""),
                 (rf"{root}\b", "the job's folder"),
             ]
+        # What an earlier attempt has noted, perhaps on another machine.
+        names.append((_OTHER_ATTEMPT, ""))
         for root in _path_patterns(work):
             names += [
                 # The folders are those of Workspace.fetch_dataset: datasets, an id, and the dataset's name.

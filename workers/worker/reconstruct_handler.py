@@ -22,7 +22,15 @@ from octasplat.engine.pipeline import (
 )
 from octasplat.engine.pipeline import reconstruct as reconstruct_scene
 from octasplat.engine.render.image_files import write_png
-from octasplat.engine.runs.run_folder import BLOCKS, CACHE, CHECKPOINTS, CONFIG, SCENE, found_model_folder
+from octasplat.engine.runs.run_folder import (
+    BLOCKS,
+    CACHE,
+    CHECKPOINTS,
+    CONFIG,
+    SCENE,
+    START,
+    found_model_folder,
+)
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.protocol import Tracer
 from octasplat.workers.worker.job_kinds.reconstruct_kinds import BlockJobConfig, ReconstructJobConfig
@@ -47,6 +55,10 @@ def reconstruct(task: Task) -> None:
         if not has_left:
             raise
         message = path_redactor(task).replace_job_paths(str(error))
+        if (task.run / START).exists():  # what the job begins with is in what was there
+            raise ConfigError(
+                f"What was there cannot be gone on with; retry the job from the start: {message}"
+            ) from None
         task.progress(Warned(f"What was there cannot be gone on with, so the job begins anew: {message}"))
         shutil.rmtree(task.run)
         shutil.rmtree(task.results)
@@ -166,6 +178,7 @@ def _run_reconstruction(task: Task) -> None:
                 should_stop=task.should_stop,
                 on_step=show_step,
                 blocks=blocks,
+                start_from=task.begins_with,
             )
     finally:
         _publish_run(task)
@@ -179,5 +192,5 @@ def _publish_run(task: Task) -> None:
         name = path.relative_to(task.run)
         # Hidden files are previews and live scenes, which are stored on their own, or files being written.
         hidden = any(part.startswith(".") for part in name.parts)
-        if path.is_file() and not hidden and name.parts[0] not in (BLOCKS, CHECKPOINTS, CACHE):
+        if path.is_file() and not hidden and name.parts[0] not in (BLOCKS, CHECKPOINTS, CACHE, START):
             publish_file(task, path, name.as_posix())

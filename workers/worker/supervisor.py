@@ -16,12 +16,9 @@ from octasplat.engine.core import versions
 from octasplat.engine.core.errors import ConfigError, OctasplatError
 from octasplat.engine.operations.precompile import request_groups
 from octasplat.workers.cancellation import cancel_and_wait
-from octasplat.workers.db.datasets import files_of, get_dataset
 from octasplat.workers.queue.attempts import Attempt, FencedError
-from octasplat.workers.queue.block_jobs import files_from_others
 from octasplat.workers.queue.job_deadlines import seconds_spent
 from octasplat.workers.queue.job_endings import MAX_SILENT_RECOVERIES
-from octasplat.workers.queue.jobs import artifacts_of
 from octasplat.workers.sandbox.confinement import MAX_PROCESSES
 from octasplat.workers.storage.errors import (
     BlobNotFoundError,
@@ -33,6 +30,7 @@ from octasplat.workers.worker.checkpoint import Checkpoint
 from octasplat.workers.worker.child_process import ChildProcess
 from octasplat.workers.worker.context import DatabaseLostError, WorkerContext
 from octasplat.workers.worker.heartbeat import DATABASE_ERRORS, Heartbeat
+from octasplat.workers.worker.job_inputs import read_inputs
 from octasplat.workers.worker.job_kinds import JobKind, get_job_kind
 from octasplat.workers.worker.job_kinds.stored_options import resolve_here
 from octasplat.workers.worker.kernels import compile_for_job
@@ -166,33 +164,33 @@ class Supervisor:
         await self._attempt.record_settings(complete, __version__)
         scene, title = None, ""
         async with self._attempt.pool.connection() as connection:
-            dataset = await get_dataset(connection, job.dataset_id) if job.dataset_id else None
-            files = await files_of(connection, job.dataset_id) if job.dataset_id else []
-            artifacts = await artifacts_of(connection, job.source_id) if job.source_id else []
-            others = await files_from_others(connection, job) if job.role is not None else []
-            named = await files_of(connection, job.files_id) if job.files_id else []
+            inputs = await read_inputs(connection, job, kind, options)
             # The limit is for all attempts of the job together.
             left = 3600 * settings.max_job_hours - await seconds_spent(connection, job)
         self._deadline_at = time.monotonic() + left
         checkpoint = None if job.checkpoint is None else Checkpoint.from_row(job.checkpoint)
-        copied = sum(a.size_bytes for a in artifacts if a.name in kind.source_files)
-        copied += sum(file.size_bytes for file in others)
+        copied = inputs.copied_bytes(kind)
         if checkpoint is not None:
             fetched = self._workspace.stored_frames.fetched(checkpoint.files)
             copied += sum(file.size_bytes for file in fetched)
         await asyncio.to_thread(self._context.disk_space.ensure_workspace, copied)
+        dataset = inputs.dataset
         if dataset is not None and (kind.needs == "dataset" or kind.needs_photographs(options)):
-            title = dataset.name
+            title, files = dataset.name, inputs.photographs
             scene = await asyncio.to_thread(self._workspace.fetch_dataset, dataset.id, files, dataset.name)
         if kind.needs == "result":
-            await asyncio.to_thread(self._workspace.fetch_source, artifacts, kind.source_files)
-        if named:
-            await asyncio.to_thread(self._workspace.fetch_files, named)
+            await asyncio.to_thread(self._workspace.fetch_source, inputs.artifacts, kind.source_files)
+        if inputs.named:
+            await asyncio.to_thread(self._workspace.fetch_files, inputs.named)
         is_restored = checkpoint is not None and await self._restore(checkpoint)
         # What blocks have made goes with the plan that is in the checkpoint.
-        if others and (job.root_id is not None or is_restored):
-            lost = await asyncio.to_thread(self._workspace.fetch_from_others, others)
+        if inputs.others and (job.root_id is not None or is_restored):
+            lost = await asyncio.to_thread(self._workspace.fetch_from_others, inputs.others)
             await self._attempt.drop_lost_blocks(lost)
+        begins_with = None
+        if kind.starts_from_result(options) and not self._workspace.has_start():
+            starts = inputs.starts
+            begins_with = await asyncio.to_thread(self._workspace.fetch_start, job.source_id, starts)
         self._reporter.set_stages(kind.stages(options))
         await compile_for_job(
             request_groups(kind.name, options),
@@ -211,6 +209,7 @@ class Supervisor:
             "options": complete,
             "scene": str(scene) if scene else None,
             "title": title,
+            "begins_with": str(begins_with) if begins_with else None,
             "threads": settings.threads,
             "hidden": [str(folder) for folder in settings.own_folders],
             "memory_limit_bytes": self._context.memory_limit_bytes,

@@ -22,6 +22,9 @@ MOVED_RESULTS_FILE = "moved_results.json"
 INFO_FILE = "info.json"
 """The result that tells what is in a scene."""
 
+POSES_FOLDER = "poses"
+"""Poses that the engine found, in its output folder and among the results."""
+
 NO_SPACE_ERROR = "no_space"
 """Type of the error of a job that met a full disk, which is no fault of its own."""
 MAX_BLOCKS = 10_000
@@ -90,6 +93,8 @@ class Task:
         progress: receives the progress events.
         should_stop: asked now and then; True asks to stop with what is needed to go on.
         kind: name of the job's kind.
+        begins_with: the run of another job that a new run begins with, or None; what an earlier attempt left
+            has its own copy of it.
     """
 
     folder: Path
@@ -100,6 +105,7 @@ class Task:
     progress: EventListener = ignore_events
     should_stop: Callable[[], bool] = field(default=lambda: False)
     kind: str = ""
+    begins_with: Path | None = None
 
     @property
     def run(self) -> Path:

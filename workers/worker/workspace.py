@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO
 
+from octasplat.engine.core.errors import ConfigError
 from octasplat.workers.db.rows import Artifact, DatasetFile, Job
 from octasplat.workers.queue.job_results import ResultFile
 from octasplat.workers.sandbox.job_users import JobUser, give_folder, open_for_reading, take_user
@@ -37,18 +38,18 @@ from octasplat.workers.storage.trees import (
 from octasplat.workers.storage.untrusted_folder import UntrustedFolder
 from octasplat.workers.worker.checkpoint import Checkpoint
 from octasplat.workers.worker.media_types import media_type
+from octasplat.workers.worker.start_files import START_RECORD
 from octasplat.workers.worker.stored_frames import StoredFrames, removes_stored_frames
-from octasplat.workers.worker.task import FILES_FOLDER, RESULTS_FOLDER, RUN_FOLDER
+from octasplat.workers.worker.task import FILES_FOLDER, POSES_FOLDER, RESULTS_FOLDER, RUN_FOLDER
 from octasplat.workers.worker.workspace_locks import LOCK_FILE, lock_dataset_folder, open_locked
 
 logger = logging.getLogger(__name__)
-POSES_FOLDER = "poses"
-"""Poses that the engine found, in its output folder and among the results."""
 
 _CHECKPOINT = re.compile(r"run/checkpoints/iteration_\d+\.npz")
 _CHECKPOINT_FILES = (
     "run/config.json", "run/held_out.json", "run/views.json", "run/events.jsonl", "run/training.json",
     "run/plan.json", "run/georeference.json", "run/scene.ply", "run/checkpoints/best.npz",
+    "run/start/best.npz", "run/start/views.json", START_RECORD,
 )  # fmt: skip
 _BLOCKS_FOLDER = "run/blocks"
 _BLOCK = re.compile(r"block_\d+")
@@ -184,6 +185,40 @@ class Workspace:
             if a.name.startswith(f"{POSES_FOLDER}/")
         ]
         fetch_tree(self.storage, [*tree, *poses], self.folder / RUN_FOLDER, writable=True)
+
+    def has_start(self) -> bool:
+        """Return whether the run has its copy of what it begins with."""
+        return (self.folder / START_RECORD).exists()
+
+    def fetch_start(self, source_id: uuid.UUID | None, choices: Sequence[Sequence[TreeFile]]) -> Path:
+        """Fetch what a run begins with into a folder that is called as the job which it is of.
+
+        Args:
+            source_id: that job; None if it was deleted.
+            choices: see :func:`octasplat.workers.worker.start_files.start_choices`; the first that is there.
+
+        Raises:
+            ConfigError: there is none.
+            StorageError: all are gone or damaged, or the folder cannot be written.
+        """
+        if source_id is None:
+            raise ConfigError("The job that this one begins with was deleted; make a new job.")
+        place = self.folder / f"job {source_id}"
+        lost: StorageError | None = None
+        for files in choices:
+            try:
+                fetch_tree(self.storage, files, place, writable=True)
+            except (BlobNotFoundError, DigestMismatchError) as error:
+                logger.warning("a start of job %s is lost: %s", self._job.id, error)
+                lost = error
+                remove_folder(place)
+                continue
+            return place
+        if lost is not None:
+            raise BlobNotFoundError(f"What {place.name} has made is gone from the store; begin with another.")
+        raise ConfigError(
+            f"{place.name} has neither a scene nor a checkpoint any more; begin with another job."
+        )
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Restore the checkpoint of an earlier attempt.

@@ -167,6 +167,7 @@ async function startOne(scene, label, isOneOfMany) {
         id = (await upload.run()).id;
     }
     const body = { kind, dataset_id: id, options: readOptions(form), queue: find("queue")?.value ?? "cpu" };
+    if (find("begin-with")?.checked) body.source_id = find("begin-with").value;
     if (label) body.label = isOneOfMany ? `${label}: ${scene.title}` : label;
     return queueJob(body, `page-${id}-${Date.now()}`);
 }

@@ -31,19 +31,26 @@ if TYPE_CHECKING:
 
 
 @click.command(short_help="Send a scene to the service and queue its reconstruction.")
-@click.argument("scene", type=SceneName())
+@click.argument("scene", type=SceneName(), required=False)
 @click.option(
     "--sha256",
     metavar="HEX",
     help="Where SCENE is an address: what the ZIP file must be; then it is fetched once only.",
+)
+@click.option(
+    "--start-from",
+    metavar="JOB",
+    help="Begin with the Gaussians of that reconstruction, finished or stopped; without SCENE on its "
+    "photographs.",
 )
 @wait_options
 @request_options(ReconstructOptions)
 @job_options
 @output_options
 def submit(
-    scene: Path | str,
+    scene: Path | str | None,
     sha256: str | None,
+    start_from: str | None,
     wait: bool,
     output: Path | None,
     label: str | None,
@@ -57,19 +64,28 @@ def submit(
 
     The same command goes on with an upload that broke off. The service itself fetches a ZIP file from a
     public https address: octasplat submit https://example.org/fox.zip
+
+    With --start-from a training goes on from where another is, with other options:
+    octasplat submit --start-from last --preset high
     """
     from octasplat.workers.cli.remote_jobs import submit, submit_and_wait
+    from octasplat.workers.client.short_ids import find_job
     from octasplat.workers.client.submission import Submission
 
     _check_output(output, wait=wait)
+    if scene is None and start_from is None:
+        raise click.UsageError("Name SCENE, or a job by --start-from, whose photographs are taken.")
     options: ReconstructOptions = request_from_options(ReconstructOptions, given)
     check_block_options(options, options.config())  # what cannot be used is refused before anything is sent
     requested = options.model_dump(mode="json", exclude_unset=True)
     what = Submission(scene, requested, label, queue, priority, sha256)
     with connected(server, awaits_start=True) as api:
-        what = replace(what, scene=_as_dataset(api, scene))
+        if scene is not None:
+            what = replace(what, scene=_as_dataset(api, scene))
+        if start_from is not None:
+            what = replace(what, start_from=str(find_job(api, start_from)["id"]))
         if wait:
-            submit_and_wait(api, what, output or Path(f"{_stem(scene)}-result"), printer)
+            submit_and_wait(api, what, output or Path(f"{_stem(scene or 'scene')}-result"), printer)
             return
         job = submit(api, what, printer)
     printer.print(job, [job["id"]], quiet_lines=[job["id"]])

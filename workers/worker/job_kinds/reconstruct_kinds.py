@@ -16,6 +16,7 @@ from octasplat.engine.operations.cost_model import (
 from octasplat.engine.operations.reconstruct import OPERATION as RECONSTRUCT
 from octasplat.engine.operations.reconstruct import options_from_json
 from octasplat.engine.runs.config import ReconstructionConfig, revise_requested
+from octasplat.engine.settings.refusals import InvalidSettingsError, Refusal
 from octasplat.engine.train.config import MAX_PLANNED_ITERATIONS, iteration_count, max_gaussian_count
 from octasplat.workers.worker.job_kinds.operation_kind import OperationKind
 from octasplat.workers.worker.job_kinds.registry import JobKind
@@ -26,7 +27,11 @@ _PROGRAMS = "octasplat.workers.worker.reconstruct_handler"
 
 
 class ReconstructJobConfig(ReconstructionConfig, BlockOptions):
-    """All settings of a job that reconstructs; those of blocks are not among the settings of its run."""
+    """All settings of a job that reconstructs; those of blocks and the start are not settings of its run."""
+
+    begins_with_source: bool = Field(
+        False, description="Begin with the Gaussians of the job in source_id, which sets it."
+    )
 
     def run_config(self) -> ReconstructionConfig:
         """Return the settings of the run."""
@@ -42,6 +47,8 @@ class BlockJobConfig(ReconstructJobConfig):
 
 
 _RUN_FIELDS = set(ReconstructionConfig.model_fields)
+_START = "begins_with_source"
+"""An option, so that it outlives the source job, and a worker that does not know it leaves the job alone."""
 
 
 class ReconstructKind(OperationKind):
@@ -49,6 +56,7 @@ class ReconstructKind(OperationKind):
 
     export_option = "exports"
     block_kind = BLOCK_KIND
+    may_start_from_result = True
 
     def __init__(self) -> None:
         super().__init__(
@@ -63,35 +71,48 @@ class ReconstructKind(OperationKind):
 
     def resolve(self, values: Mapping[str, Any]) -> ReconstructJobConfig:
         """Return complete options: those of the preset, overridden by the given ones."""
-        options = options_from_json(values)
-        return _with_blocks(options.config(), options.blocks, options.memory)
+        options = options_from_json(_without_start(values))
+        return _complete(
+            options.config(), options.blocks, options.memory, begins_with_source=values.get(_START, False)
+        )
 
     def revise(self, options: Mapping[str, Any], changes: Mapping[str, Any]) -> ReconstructJobConfig:
         """Return the options of a job with changes; another preset brings its own settings."""
         given = options_from_json(changes)
         blocks = {name: options.get(name) for name in BlockOptions.model_fields}
         blocks |= {name: getattr(given, name) for name in blocks if name in given.model_fields_set}
-        run = {name: value for name, value in options.items() if name not in blocks}
-        return _with_blocks(given.revised(run), **blocks)
+        run = {name: value for name, value in options.items() if name not in (*blocks, _START)}
+        return _complete(given.revised(run), **blocks, begins_with_source=options.get(_START, False))
 
     def as_requested(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return the given settings, those of the training by their places below ``train``."""
-        options = options_from_json(values)
-        blocks = {
+        options = options_from_json(_without_start(values))
+        others: dict[str, Any] = {
             name: getattr(options, name)
             for name in BlockOptions.model_fields
             if name in options.model_fields_set
         }
-        return {**options.requested(), **blocks}
+        if values.get(_START, False):
+            others[_START] = True
+        return {**options.requested(), **others}
 
     def revise_requested(self, requested: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
         """Return the given settings with changes; another preset brings its own settings."""
         return revise_requested(requested, changes)
 
     def stages(self, options: ReconstructJobConfig) -> tuple[str, ...]:
-        """Return the stages, those that find poses among them if there are none."""
+        """Return the stages, those that find poses among them if there are none, nor any of a source job."""
         stages = ("load", "train", "evaluate", "export")
-        return stages if options.poses == "given" else ("features", "matches", "poses", *stages)
+        is_posed = options.poses == "given" or options.begins_with_source
+        return stages if is_posed else ("features", "matches", "poses", *stages)
+
+    def starts_from_result(self, options: ReconstructJobConfig) -> bool:
+        """Return whether the training begins with the Gaussians of the source job."""
+        return options.begins_with_source
+
+    def with_start(self, options: ReconstructJobConfig) -> ReconstructJobConfig:
+        """Return the options of a training that begins with the Gaussians of the source job, in one piece."""
+        return _complete(options.run_config(), options.blocks, options.memory, begins_with_source=True)
 
     def needs_poses(self, options: ReconstructJobConfig) -> bool:
         """Return whether the dataset must hold a COLMAP model."""
@@ -162,9 +183,23 @@ class BlockKind(JobKind[BlockJobConfig]):
         )
 
 
-def _with_blocks(
-    config: ReconstructionConfig, blocks: Any = None, memory: str | None = None
+def _complete(
+    config: ReconstructionConfig,
+    blocks: Any = None,
+    memory: str | None = None,
+    *,
+    begins_with_source: bool = False,
 ) -> ReconstructJobConfig:
+    """Return the settings of a job: those of its run, of its blocks, and what it begins with."""
     check_block_options(BlockOptions(blocks=blocks, memory=memory), config)
-    given = config.model_dump(mode="json")
-    return ReconstructJobConfig.model_validate({**given, "blocks": blocks, "memory": memory})
+    others = {"blocks": blocks, "memory": memory, _START: begins_with_source}
+    job = ReconstructJobConfig.model_validate({**config.model_dump(mode="json"), **others})
+    if job.begins_with_source and job.blocks is not None:
+        detail = "A scene that is trained in blocks begins anew; leave blocks out, or the job to begin with."
+        raise InvalidSettingsError([Refusal(("blocks",), "blocks", detail)])
+    return job
+
+
+def _without_start(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return options without what only jobs have."""
+    return {name: value for name, value in values.items() if name != _START}

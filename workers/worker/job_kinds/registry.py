@@ -44,6 +44,8 @@ class JobKind(Generic[OptionsT]):
     """Whether options may name files, which are uploaded as a dataset that holds files."""
     takes_other_photographs = False
     """Whether a job may name photographs to work on in the place of the source job's."""
+    may_start_from_result = False
+    """Whether a job on a dataset may begin with what another job of its kind has come to."""
     keeps_world_frame = True
     """Whether what is made stands where the photographs of the source job show it."""
     export_option = ""
@@ -101,6 +103,18 @@ class JobKind(Generic[OptionsT]):
 
     def for_other_photographs(self, options: OptionsT) -> OptionsT:
         """Return the options as they are kept where the job names photographs of its own."""
+        return options
+
+    def starts_from_result(self, options: OptionsT) -> bool:
+        """Return whether the job begins with what its source job has come to, and so cannot begin without."""
+        return False
+
+    def with_start(self, options: OptionsT) -> OptionsT:
+        """Return the options as they are kept where the job begins with what its source job has come to.
+
+        Raises:
+            InvalidSettingsError: with these options it cannot.
+        """
         return options
 
     def needs_poses(self, options: OptionsT) -> bool:

@@ -1,0 +1,58 @@
+"""What a job works on: its photographs, files that it names, and results of other jobs."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from pydantic import BaseModel
+
+from octasplat.workers.db.connections import Connection
+from octasplat.workers.db.datasets import files_of, get_dataset
+from octasplat.workers.db.rows import Artifact, Dataset, DatasetFile, Job
+from octasplat.workers.queue.block_jobs import files_from_others
+from octasplat.workers.queue.jobs import artifacts_of, get_job
+from octasplat.workers.storage.trees import TreeFile
+from octasplat.workers.worker.job_kinds import JobKind
+from octasplat.workers.worker.start_files import start_choices
+
+
+@dataclass(frozen=True)
+class JobInputs:
+    """Rows of what a job works on.
+
+    Attributes:
+        dataset: the photographs, if it has some.
+        photographs: the files of the dataset.
+        artifacts: results of the source job.
+        starts: what it may begin with, if it begins with the source job; see
+            :func:`octasplat.workers.worker.start_files.start_choices`.
+        others: what other jobs have made for it.
+        named: files that its options name.
+    """
+
+    dataset: Dataset | None
+    photographs: Sequence[DatasetFile]
+    artifacts: Sequence[Artifact]
+    starts: Sequence[Sequence[TreeFile]]
+    others: Sequence[TreeFile]
+    named: Sequence[DatasetFile]
+
+    def copied_bytes(self, kind: JobKind) -> int:
+        """Return the bytes of what is copied into the folder of an attempt, without its checkpoint."""
+        copied = sum(row.size_bytes for row in self.artifacts if row.name in kind.source_files)
+        copied += max((sum(file.size_bytes for file in files) for files in self.starts), default=0)
+        return copied + sum(file.size_bytes for file in self.others)
+
+
+async def read_inputs(connection: Connection, job: Job, kind: JobKind, options: BaseModel) -> JobInputs:
+    """Return what a job with these complete options works on."""
+    source = await get_job(connection, job.source_id) if job.source_id else None
+    artifacts = await artifacts_of(connection, job.source_id) if job.source_id else []
+    begins = source is not None and kind.starts_from_result(options)
+    return JobInputs(
+        dataset=await get_dataset(connection, job.dataset_id) if job.dataset_id else None,
+        photographs=await files_of(connection, job.dataset_id) if job.dataset_id else [],
+        artifacts=artifacts,
+        starts=start_choices(source, artifacts) if begins and source is not None else [],
+        others=await files_from_others(connection, job) if job.role is not None else [],
+        named=await files_of(connection, job.files_id) if job.files_id else [],
+    )
