@@ -9,6 +9,7 @@ PACKAGES = (
     "embreex",  # Embree: which rays meet which boxes
     "fast-simplification",  # fewer triangles for surfaces
     "flip-evaluator",
+    "laspy",  # reads laser scans
     "llvmlite",  # compiles the kernels
     "numba",
     "numpy",
