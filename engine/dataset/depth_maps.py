@@ -37,7 +37,7 @@ from octasplat.engine.dataset.mapped_array import MappedArray
 from octasplat.engine.dataset.model import DatasetModel
 from octasplat.engine.dataset.pixel_cache import file_sha256
 
-CACHE_VERSION = 3
+CACHE_VERSION = 4
 """Raised whenever the contents of the cache file change for the same maps."""
 INTEGER_UNIT = 0.001
 """Metres for one unit of integers, as depth cameras store them."""
@@ -65,6 +65,7 @@ class DepthMaps:
         sizes_px: width and height of each view's map.
         unit_world: world units for one unit of the stored values, by view.
         are_of_geometry: which of them come from the known geometry, in world units.
+        have_depths: which of them hold a depth at all.
     """
 
     values: MappedArray
@@ -72,6 +73,7 @@ class DepthMaps:
     sizes_px: Int64[np.ndarray, "v 2"]
     unit_world: Float64[np.ndarray, " v"]
     are_of_geometry: Bool[np.ndarray, " v"]
+    have_depths: Bool[np.ndarray, " v"]
 
     def z_world(
         self,
@@ -218,6 +220,7 @@ def open_depth_maps(
         sizes,
         np.where(of_geometry, 1.0, units),
         of_geometry,
+        np.array(index["have_depths"]),
     )
 
 
@@ -272,12 +275,7 @@ def check_geometry(
     Raises:
         DatasetError: no photograph shows it, or it stands elsewhere.
     """
-    shown = maps.values.values
-    seeing = sum(
-        bool(shown[first:last].any())
-        for first, last, counts in zip(maps.offsets[:-1], maps.offsets[1:], maps.are_of_geometry, strict=True)
-        if counts
-    )
+    seeing = int((maps.are_of_geometry & maps.have_depths).sum())
     way_out = "it must be in the coordinates of the poses; move it there, or take the file away."
     if seeing == 0 and maps.are_of_geometry.any():
         raise DatasetError(f"{geometry.path} is seen by none of the photographs: {way_out}")
@@ -322,6 +320,7 @@ class _Index(TypedDict):
     digest: str
     sizes_px: list[list[int]]
     are_integers: list[bool]
+    have_depths: list[bool]
 
 
 def _read_index(folder: Path, digest: str, have_maps: Sequence[bool]) -> _Index | None:
@@ -345,6 +344,7 @@ def _decode(
     (folder / _INDEX).unlink(missing_ok=True)  # an index must never describe a file that is being written
     sizes_px: list[list[int]] = []
     are_integers: list[bool] = []
+    have_depths: list[bool] = []
     with (
         ThreadPoolExecutor(threads if threads > 0 else os.cpu_count() or 1) as pool,
         atomic_replace(folder / _VALUES) as path,
@@ -363,9 +363,11 @@ def _decode(
                 depth = of_geometry.view(view, model.cameras[view.camera_index])
             sizes_px.append([depth.shape[1], depth.shape[0]])
             are_integers.append(is_integer)
+            have_depths.append(bool(depth.any()))
             file.write(depth.tobytes())
     index: _Index = {
         "version": CACHE_VERSION, "digest": digest, "sizes_px": sizes_px, "are_integers": are_integers,
+        "have_depths": have_depths,
     }  # fmt: skip
     write_json(folder / _INDEX, index)
     return index

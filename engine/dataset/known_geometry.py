@@ -24,6 +24,8 @@ MAX_SIDE_PX = 800
 """Longer side of the depth maps; a ray of the training takes the depth of the pixel that it falls into."""
 MAX_POINTS = 1_000_000
 """Of more points, one in each cell of a grid is kept."""
+SPREAD_SHARE = 0.02
+"""Share of the points beyond each end of the spread by which the grid is chosen."""
 POINTS_AT_ONCE = 1 << 16
 """So many get their planes at once, to take little memory."""
 NEIGHBOURS = 8
@@ -115,13 +117,13 @@ def thin_points(points: Float64[np.ndarray, "n 3"], at_most: int) -> Float64[np.
     """
     if len(points) <= at_most:
         return points
-    low = points.min(axis=0)
-    # of a surface, so that the count falls with the square of the side
-    side = float(np.linalg.norm(np.ptp(points, axis=0))) / np.sqrt(at_most)
+    low, middle, high = np.quantile(points, (SPREAD_SHARE, 0.5, 1 - SPREAD_SHARE), axis=0)
+    # of a surface, so that the count falls with the square of the side; single points far away do not count
+    side = float(np.linalg.norm(high - low)) / np.sqrt(at_most) or np.inf
     while True:
-        cells = np.floor((points - low) / side).astype(np.int64)
-        counts = cells.max(axis=0) + 1
-        keys = (cells[:, 0] * counts[1] + cells[:, 1]) * counts[2] + cells[:, 2]
+        # 21 bits an axis are one key; what lies farther away than that shares the outermost cells
+        cells = np.clip(np.floor((points - middle) / side), -(1 << 20), (1 << 20) - 1).astype(np.int64)
+        keys = np.einsum("nk,k->n", cells + (1 << 20), np.array([1 << 42, 1 << 21, 1]))
         first = np.sort(np.unique(keys, return_index=True)[1])
         if len(first) <= at_most:
             return points[first]

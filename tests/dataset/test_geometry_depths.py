@@ -74,6 +74,10 @@ def test_thinning_keeps_points_and_a_limit() -> None:
     assert 200 < len(thin) <= 700
     assert len(np.unique(np.concatenate([points, thin]), axis=0)) == len(points)  # nothing new
     assert thin_points(points, 5000) is points
+    # one reading far away does not make the cells large
+    strays = np.concatenate([points, np.full((1, 3), 1e7)])
+    assert 200 < len(thin_points(strays, 700)) <= 700
+    assert len(thin_points(np.zeros((50, 3)), 10)) == 1
 
 
 @pytest.mark.parametrize("name", ["geometry.las", "geometry.laz"])
