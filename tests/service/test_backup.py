@@ -1,10 +1,13 @@
 """A backup made while the service runs, restored elsewhere: everything is there and goes on."""
 
 import asyncio
+import json
 import os
 import subprocess
 import sys
+import time
 import uuid
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -167,6 +170,25 @@ def test_backup_of_an_earlier_version_is_restored(postgres: EmbeddedPostgres, tm
             assert connection.execute("SELECT bytes FROM owner_usage WHERE bytes > 0").fetchall() == [(12,)]
         with there.open(blob.sha256) as file:
             assert file.read() == content
+
+
+def test_backup_beside_a_migration_is_repeated_after_a_deadlock(conninfo: str, tmp_path: Path) -> None:
+    waiting_backup = "SELECT FROM pg_locks WHERE relation = 'artifacts'::regclass AND NOT granted"
+    with ThreadPoolExecutor() as threads, psycopg.connect(conninfo) as changing:
+        changing.execute("ALTER TABLE artifacts ADD COLUMN later_a text NOT NULL DEFAULT 'a'")
+        made = threads.submit(
+            create_backup, conninfo, LocalStorage(tmp_path / "store", floor_bytes=0), tmp_path / "backup"
+        )
+        while changing.execute(waiting_backup).fetchone() is None:
+            assert not made.done(), made.result()
+            time.sleep(0.01)
+        # The backup has waited longer, so that the deadlock is found on its side.
+        changing.execute("ALTER TABLE datasets ADD COLUMN later_d text NOT NULL DEFAULT 'd'")
+        changing.commit()
+        made.result()
+    tables = json.loads((tmp_path / "backup" / "backup.json").read_text())["tables"]
+    columns = {table["name"]: table["columns"] for table in tables}
+    assert columns["artifacts"][-1] == "later_a" and columns["datasets"][-1] == "later_d"
 
 
 @pytest.mark.parametrize("folder", ["nothing", "other"])

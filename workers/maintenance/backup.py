@@ -10,21 +10,25 @@ queued or under way when it was made are queued again where it is restored, and 
 
 import contextlib
 import json
-import os
 import shutil
-import uuid
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, LiteralString
+from typing import Any
 
 import psycopg
-from psycopg import sql
 
 from octasplat.engine import __version__
 from octasplat.engine.core.errors import OctasplatError
 from octasplat.engine.core.writing import write_json
 from octasplat.workers.db.migrate import OWN_COMPONENT, all_migrations, migrate
+from octasplat.workers.maintenance.backup_tables import (
+    TABLES_PREFIX,
+    copy_tables,
+    name_content,
+    read_table,
+    referenced_contents,
+)
 from octasplat.workers.storage.errors import BlobNotFoundError, DigestMismatchError
 from octasplat.workers.storage.local import LocalStorage
 from octasplat.workers.storage.os_errors import translate_os_errors
@@ -32,27 +36,7 @@ from octasplat.workers.storage.protocol import Storage
 from octasplat.workers.storage.trees import read_manifest
 
 FORMAT = 1
-BACKUP_FILE, TABLES_PREFIX, STORE_FOLDER = "backup.json", "tables-", "store"
-# What migrate writes by itself, and what processes write that do not run where it is restored.
-_EXCLUDED_TABLES = ("schema_steps", "schema_reach", "workers", "storing", "removing_contents")
-_REFERENCES: Mapping[str, LiteralString] = {
-    "dataset_files": """
-        SELECT sha256, 'The file ' || path || ' of the dataset ' || dataset_id FROM dataset_files
-        """,
-    "upload_parts": "SELECT sha256, 'A part of the upload ' || upload_id FROM upload_parts",
-    "artifacts": "SELECT sha256, 'The result ' || name || ' of the job ' || job_id FROM artifacts",
-    "jobs": """
-        SELECT file->>'sha256', 'The checkpoint of the job ' || id
-        FROM jobs, jsonb_array_elements(checkpoint->'files') AS file
-        UNION ALL
-        SELECT preview->>'sha256', 'The preview of the job ' || id FROM jobs WHERE preview ? 'sha256'
-        """,
-    "live_scenes": """
-        SELECT content, 'The live scene of the job ' || job_id
-        FROM live_scenes, unnest(ARRAY[sha256, views_sha256]) AS content
-        """,
-}
-"""By table, what selects the digests of contents that its rows name, and what to call the place."""
+BACKUP_FILE, STORE_FOLDER = "backup.json", "store"
 
 
 class BackupError(OctasplatError):
@@ -109,37 +93,23 @@ def create_backup(
     with psycopg.connect(conninfo) as collecting:
         # Whoever collects unused contents leaves it to us, so that all that is named now stays.
         collecting.execute("SELECT id FROM installation FOR UPDATE")
-        # The snapshot ends before contents are copied: its locks hold up whoever changes the tables.
-        with psycopg.connect(conninfo) as connection:
-            connection.isolation_level = psycopg.IsolationLevel.REPEATABLE_READ
-            connection.read_only = True
-            rows = folder / f"{TABLES_PREFIX}{uuid.uuid4().hex[:12]}"
-            with translate_os_errors(folder):
-                rows.mkdir(mode=0o700)
-            tables = [_write_table(connection, name, rows) for name in _ordered_tables(connection)]
-            steps = [name for (name,) in connection.execute(
-                "SELECT name FROM schema_steps WHERE component = %s ORDER BY name", [OWN_COMPONENT]
-            )]  # fmt: skip
-            sequences: dict[str, int] = dict(connection.execute(
-                "SELECT sequencename, last_value FROM pg_sequences "
-                "WHERE schemaname = current_schema() AND last_value IS NOT NULL"
-            ).fetchall())  # fmt: skip
-            referenced = _referenced_contents(connection)
-            jobs = {str(job_id) for (job_id,) in connection.execute("SELECT id FROM jobs")}
+        snapshot = copy_tables(conninfo, folder)
         copy = LocalStorage(folder / STORE_FOLDER, floor_bytes=0)
-        copied = _copy_store(storage, copy, referenced, jobs, on_content)
-        damaged = tuple(_name_content(collecting, sha256, fault) for sha256, fault in copied.faults.items())
+        copied = _copy_store(storage, copy, snapshot.referenced, snapshot.jobs, on_content)
+        # On a connection that holds no lock while it waits for a table.
+        with psycopg.connect(conninfo, autocommit=True) as naming:
+            damaged = tuple(name_content(naming, sha256, fault) for sha256, fault in copied.faults.items())
     record = {
-        "format": FORMAT, "version": __version__, "folder": rows.name,
-        "steps": steps, "tables": tables, "sequences": sequences, "lacks": sorted(copied.faults),
+        "format": FORMAT, "version": __version__, "folder": snapshot.folder.name, "steps": snapshot.steps,
+        "tables": snapshot.tables, "sequences": snapshot.sequences, "lacks": sorted(copied.faults),
     }  # fmt: skip
     # Last, as until then the folder still is the earlier backup.
     with translate_os_errors(folder):
         write_json(folder / BACKUP_FILE, record)
         for earlier in folder.glob(f"{TABLES_PREFIX}*"):
-            if earlier != rows:
+            if earlier != snapshot.folder:
                 shutil.rmtree(earlier, ignore_errors=True)
-    rows_copied = sum(table["rows"] for table in tables)
+    rows_copied = sum(table["rows"] for table in snapshot.tables)
     return BackupSummary(rows_copied, copied.contents, copied.size_bytes, damaged)
 
 
@@ -173,9 +143,9 @@ def restore_backup(
         copy = LocalStorage(folder / STORE_FOLDER, floor_bytes=0)
         listed = {entry.blob.sha256 for entry in copy.list_blobs()}
         copied = _copy_store(copy, storage, listed, None, on_content)
-        damaged = tuple(_name_content(connection, sha256, fault) for sha256, fault in copied.faults.items())
+        damaged = tuple(name_content(connection, sha256, fault) for sha256, fault in copied.faults.items())
         for table in record["tables"]:
-            _read_table(connection, table, folder / record["folder"])
+            read_table(connection, table, folder / record["folder"])
         for name, value in record["sequences"].items():
             if connection.execute("SELECT to_regclass(%s)", [name]).fetchone() != (None,):
                 connection.execute("SELECT setval(%s::regclass, %s)", [name, value])
@@ -185,7 +155,7 @@ def restore_backup(
             "UPDATE jobs SET state = 'canceled', finished_at = now(), slip = NULL, seconds_left = NULL "
             "WHERE state = 'canceling'"
         )
-        missing = _referenced_contents(connection) - listed
+        missing = referenced_contents(connection) - listed
         missing -= set(record.get("lacks", ()))  # of which was told when it was made
         if missing:
             raise BackupError(
@@ -194,67 +164,6 @@ def restore_backup(
     migrate(conninfo)
     rows_copied = sum(table["rows"] for table in record["tables"])
     return BackupSummary(rows_copied, copied.contents, copied.size_bytes, damaged)
-
-
-def _ordered_tables(connection: psycopg.Connection) -> list[str]:
-    """Return our tables, each after those that it references."""
-    rows = connection.execute(
-        "SELECT tablename FROM pg_tables WHERE schemaname = current_schema() "
-        "AND tablename NOT LIKE 'procrastinate%' ORDER BY 1"
-    )
-    left = [name for (name,) in rows if name not in _EXCLUDED_TABLES]
-    refers = connection.execute(
-        "SELECT conrelid::regclass::text, confrelid::regclass::text FROM pg_constraint WHERE contype = 'f'"
-    ).fetchall()
-    ordered: list[str] = []
-    while left:
-        free = [t for t in left if not any(a == t and b in left and b != t for a, b in refers)]
-        ordered += free
-        left = [t for t in left if t not in free]
-    return ordered
-
-
-def _write_table(connection: psycopg.Connection, name: str, folder: Path) -> dict[str, Any]:
-    columns = [column for (column,) in connection.execute(
-        "SELECT attname FROM pg_attribute WHERE attrelid = %s::regclass AND attnum > 0 AND NOT attisdropped "
-        "ORDER BY attnum", [name]
-    )]  # fmt: skip
-    rows = 0
-    with (
-        translate_os_errors(folder),
-        (folder / f"{name}.copy").open("wb") as handle,
-        connection.cursor() as cursor,
-    ):
-        with cursor.copy(
-            sql.SQL("COPY {} ({}) TO STDOUT").format(*_table_identifiers(name, columns))
-        ) as copy:
-            for piece in copy:
-                # COPY writes one line for each row, and escapes line ends within values.
-                rows += bytes(piece).count(b"\n")
-                handle.write(piece)
-        handle.flush()
-        os.fsync(handle.fileno())
-    return {"name": name, "columns": columns, "rows": rows}
-
-
-def _read_table(connection: psycopg.Connection, table: dict[str, Any], folder: Path) -> None:
-    """Read rows unchanged, with triggers disabled."""
-    name, columns = _table_identifiers(table["name"], table["columns"])
-    connection.execute(sql.SQL("ALTER TABLE {} DISABLE TRIGGER USER").format(name))
-    connection.execute(sql.SQL("DELETE FROM {}").format(name))
-    with (
-        translate_os_errors(folder),
-        (folder / f"{table['name']}.copy").open("rb") as handle,
-        connection.cursor() as cursor,
-        cursor.copy(sql.SQL("COPY {} ({}) FROM STDIN").format(name, columns)) as copy,
-    ):
-        while piece := handle.read(1 << 20):
-            copy.write(piece)
-    connection.execute(sql.SQL("ALTER TABLE {} ENABLE TRIGGER USER").format(name))
-
-
-def _table_identifiers(name: str, columns: list[str]) -> tuple[sql.Composable, sql.Composable]:
-    return sql.Identifier(name), sql.SQL(", ").join(map(sql.Identifier, columns))
 
 
 def _copy_store(
@@ -317,28 +226,6 @@ def _copy_content(source: Storage, target: Storage, sha256: str) -> int:
             writer.write(piece)
         writer.commit()
     return blob.size_bytes
-
-
-def _referenced_contents(connection: psycopg.Connection) -> set[str]:
-    query = sql.SQL("SELECT DISTINCT sha256 FROM ({}) AS named (sha256, place)")
-    return {sha256 for (sha256,) in connection.execute(query.format(_references(connection)))}
-
-
-def _references(connection: psycopg.Connection) -> sql.Composed:
-    """Return the query of :data:`_REFERENCES` for the tables that are there; an earlier version has fewer."""
-    there = {name for (name,) in connection.execute(
-        "SELECT tablename FROM pg_tables WHERE schemaname = current_schema()"
-    )}  # fmt: skip
-    return sql.SQL(" UNION ALL ").join(
-        sql.SQL(query) for table, query in _REFERENCES.items() if table in there
-    )
-
-
-def _name_content(connection: psycopg.Connection, sha256: str, fault: str) -> str:
-    """Return a sentence on a content that is ``damaged`` or ``missing``, with a place that names it."""
-    query = sql.SQL("SELECT place FROM ({}) AS named (sha256, place) WHERE sha256 = %s LIMIT 1")
-    row = connection.execute(query.format(_references(connection)), [sha256]).fetchone()
-    return f"{row[0] if row is not None else 'A content'} is {fault} in the store ({sha256})."
 
 
 def _read_backup_file(folder: Path) -> dict[str, Any]:
