@@ -20,18 +20,18 @@ DEMO_ASSIGNMENTS: dict[str, tuple[str, ...]] = {"fast": ("iterations=2000",)}
 """Training settings by preset, chosen so that the demo takes less than three minutes on two cores."""
 
 
-def make_demo_scene(root: Path, size: Mapping[str, int | None], *, quiet: bool) -> None:
+def make_demo_scene(root: Path, settings: Mapping[str, int | str | None], *, quiet: bool) -> None:
     """Write the generated scene unless it is there.
 
     Args:
         root: folder of the scene.
-        size: fields of :class:`SyntheticDatasetConfig`; None values take the default.
+        settings: fields of :class:`SyntheticDatasetConfig`; None values take the default.
         quiet: show no progress.
 
     Raises:
-        OctasplatError: the folder holds something else or cannot be written, or a size is out of range.
+        OctasplatError: the folder holds something else or cannot be written, or a setting is out of range.
     """
-    given: dict[str, Any] = {name: value for name, value in size.items() if value is not None}
+    given: dict[str, Any] = {name: value for name, value in settings.items() if value is not None}
     config = SyntheticDatasetConfig(**given)
     if (root / "generated.json").exists():
         write_synthetic_dataset(root, config)  # only makes sure that it is the same

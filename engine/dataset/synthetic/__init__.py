@@ -1,4 +1,4 @@
-"""A photographed-like dataset that the project makes itself: a still life, ray-traced, as a COLMAP dataset.
+"""Datasets that the project makes itself: a still life or a street, ray-traced, with a COLMAP model.
 
 A scene folder holds::
 
@@ -11,7 +11,8 @@ A scene folder holds::
     ground_truth/mesh.ply             everything as one triangle mesh, in the world frame
     generated.json                    the settings, written last
 
-The world is in metres, z up, the table top in the plane z = 0 around the origin.
+The world is in metres, z up, the table top in the plane z = 0 around the origin; or the street along x, and
+the ground in that plane.
 """
 
 import json
@@ -95,7 +96,9 @@ def _check_stamp(root: Path, stamp: dict[str, object]) -> None:
         raise DatasetError(
             f"{root} holds files but no complete generated scene; empty it or name another folder."
         ) from error
-    if found != stamp:
+    # What earlier versions wrote lacks settings that have come since; they had the defaults.
+    found_config = {**SyntheticDatasetConfig().as_dict(), **found.get("config", {})}
+    if {**found, "config": found_config} != stamp:
         raise DatasetError(
             f"{root} holds a generated scene made with other settings; delete it or name another folder."
         )

@@ -4,6 +4,7 @@ from dataclasses import asdict, dataclass
 
 from octasplat.engine.core.errors import ConfigError
 
+SCENES = ("still_life", "street")
 CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE")
 
 
@@ -12,7 +13,7 @@ class SyntheticDatasetConfig:
     """Settings of a generated scene; on one machine equal settings give equal files, byte for byte.
 
     Attributes:
-        views: Number of photographs, on three rings around the table.
+        views: Number of photographs: on three rings around the table, or on two walks along the street.
         width_px: Width of a photograph.
         height_px: Height of a photograph.
         samples_per_side: A pixel is the mean of this number squared of display colors, on a regular grid.
@@ -21,8 +22,9 @@ class SyntheticDatasetConfig:
         camera_model: COLMAP's name of the lens, one of ``CAMERA_MODELS``; it distorts the
             photographs accordingly.
         transparent: Write RGBA photographs (straight alpha) that show the table and its objects only, with
-            their coverage of each pixel as alpha.
+            their coverage of each pixel as alpha. Of the street all but the sky is shown.
         with_masks: Also write the object masks where a reconstruction looks for them: ``masks/``.
+        scene: One of ``SCENES``: a still life on a table, or a street of 112 m for captures of many views.
 
     Raises:
         ConfigError: If a value is out of range.
@@ -37,10 +39,11 @@ class SyntheticDatasetConfig:
     camera_model: str = "PINHOLE"
     transparent: bool = False
     with_masks: bool = False
+    scene: str = "still_life"
 
     def __post_init__(self) -> None:
         ranges = {
-            "views": (3, 1000),
+            "views": (3, 100_000),
             "width_px": (8, 8192),
             "height_px": (8, 8192),
             "samples_per_side": (1, 16),
@@ -53,6 +56,9 @@ class SyntheticDatasetConfig:
                 raise ConfigError(
                     f"Generated scene: {name} is {value}, but must lie between {low} and {high}."
                 )
+        if self.scene not in SCENES:
+            names = ", ".join(SCENES)
+            raise ConfigError(f"Generated scene: scene is {self.scene!r}, but must be one of {names}.")
         if self.camera_model not in CAMERA_MODELS:
             names = ", ".join(CAMERA_MODELS)
             raise ConfigError(

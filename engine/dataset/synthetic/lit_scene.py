@@ -1,4 +1,4 @@
-"""The still life in Embree, lit once: irradiance of each vertex, and colors of hits."""
+"""A scene of objects in Embree, lit once: irradiance of each vertex, and colors of hits."""
 
 import os
 from concurrent.futures import ThreadPoolExecutor
@@ -9,16 +9,13 @@ from jaxtyping import Float, Float32
 from octasplat.engine.core.color import linear_to_srgb
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.dataset.synthetic.kernels import noise
-from octasplat.engine.dataset.synthetic.still_life import StillLife
+from octasplat.engine.dataset.synthetic.object_scene import Lamp, ObjectScene
 from octasplat.engine.trace.triangle_bvh import TriangleBvh, TriangleHits
 
 # Fixed, so that equal sums are summed alike on every machine.
 _CHUNKS = 16
 THREADS = min(8, os.cpu_count() or 1)
 
-_LAMP_WORLD = np.array([1.9, -1.5, 4.2])
-_LAMP_RADIUS = 0.4
-_LAMP = np.array([1.0, 0.9, 0.76]) * 42.0
 _SPECULAR_STRENGTH = np.array([9.0, 8.2, 7.0], np.float32)
 _ZENITH, _HORIZON, _INDIRECT_LIGHT = (
     np.array(c) for c in ([0.34, 0.42, 0.6], [0.5, 0.5, 0.52], [0.15, 0.125, 0.1])
@@ -31,15 +28,15 @@ _UV, _XYZ, _NORMAL, _LIGHT, _LAMP_SEEN = slice(0, 2), slice(2, 5), slice(5, 8), 
 
 
 class LitScene:
-    """The still life ready to be photographed; its methods may be called from several threads."""
+    """A scene ready to be photographed; its methods may be called from several threads."""
 
-    def __init__(self, still_life: StillLife) -> None:
-        self.still_life = still_life
-        self._mesh = TriangleBvh(still_life.vertices, still_life.faces, threads=1)
+    def __init__(self, unlit: ObjectScene) -> None:
+        self.unlit = unlit
+        self._mesh = TriangleBvh(unlit.vertices, unlit.faces, threads=1)
         light, lamp_seen = self._vertex_irradiance()
         self._attributes = np.ascontiguousarray(
             np.concatenate(
-                [still_life.uv, still_life.texture_xyz, still_life.vertex_normals, light, lamp_seen[:, None]],
+                [unlit.uv, unlit.texture_xyz, unlit.vertex_normals, light, lamp_seen[:, None]],
                 axis=1,
             ),
             dtype=np.float32,
@@ -59,7 +56,7 @@ class LitScene:
 
     def _vertex_irradiance(self) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, " n"]]:
         """Return the irradiance of each vertex (lamp, sky, constant indirect) and the lamp's visibility."""
-        pieces = np.array_split(np.arange(len(self.still_life.vertices)), _CHUNKS)
+        pieces = np.array_split(np.arange(len(self.unlit.vertices)), _CHUNKS)
         with ThreadPoolExecutor(THREADS) as pool:
             parts = list(pool.map(self._irradiance_at, pieces))
         return np.concatenate([light for light, _ in parts]), np.concatenate(
@@ -69,10 +66,10 @@ class LitScene:
     def _irradiance_at(
         self, which: np.ndarray
     ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, " n"]]:
-        normals = self.still_life.vertex_normals[which].astype(np.float64)
-        starts = self.still_life.vertices[which] + _SHADOW_RAY_OFFSET * normals
+        normals = self.unlit.vertex_normals[which].astype(np.float64)
+        starts = self.unlit.vertices[which] + _SHADOW_RAY_OFFSET * normals
         light, visibility = np.zeros_like(starts), np.zeros(len(starts))
-        lamp_points = _lamp_points(36)
+        lamp_points = _lamp_points(self.unlit.lamp, 36)
         for lamp_point in lamp_points:
             way = lamp_point - starts
             squared = np.sum(way * way, axis=1)
@@ -81,14 +78,14 @@ class LitScene:
             lit = np.flatnonzero(cosine > 0)
             free[lit] = self._shadow_transmittance(starts[lit], way[lit])
             visibility += free / len(lamp_points)
-            light += (free * cosine / squared)[:, None] * _LAMP / len(lamp_points)
+            light += (free * cosine / squared)[:, None] * self.unlit.lamp.intensity / len(lamp_points)
         directions = _sphere_directions(112)
         for direction in directions:
             cosine = np.maximum(np.sum(normals * direction, axis=1), 0)
             up = np.flatnonzero(cosine > 0)
             free = np.zeros((len(starts), 1))
             free[up, 0] = self._shadow_transmittance(
-                starts[up], np.broadcast_to(20 * direction, (len(up), 3))
+                starts[up], np.broadcast_to(self.unlit.sky_distance * direction, (len(up), 3))
             )
             sky = np.zeros(3) if direction[2] <= 0 else _sky_radiance(direction[None])[0]
             # 4 pi / n steradians a direction, over pi for a diffuse surface
@@ -106,10 +103,10 @@ class LitScene:
         faces = hits.faces[hit]
         at = np.empty((len(hit), self._attributes.shape[1]), np.float32)
         u, v = np.ascontiguousarray(hits.barycentrics[hit].T)
-        noise.interpolate_attributes(self._attributes, self.still_life.faces, faces, u, v, at)
-        kinds = self.still_life.face_object[faces]
+        noise.interpolate_attributes(self._attributes, self.unlit.faces, faces, u, v, at)
+        kinds = self.unlit.face_object[faces]
         for kind in np.unique(kinds):
-            scene_object = self.still_life.objects[kind]
+            scene_object = self.unlit.objects[kind]
             mine = np.flatnonzero(kinds == kind)
             here = at[mine]
             albedo = scene_object.material(
@@ -121,7 +118,7 @@ class LitScene:
                 places = origins[rays] + hits.distances[rays, None] * directions[rays]
                 bright += (
                     np.float32(scene_object.specular)
-                    * _phong_highlight(places, directions[rays], here[:, _NORMAL])[:, None]
+                    * _phong_highlight(self.unlit.lamp, places, directions[rays], here[:, _NORMAL])[:, None]
                     * (here[:, _LAMP_SEEN, None] * _SPECULAR_STRENGTH)
                 )
             radiance[hit[mine]] = bright
@@ -129,13 +126,14 @@ class LitScene:
 
 
 def _phong_highlight(
+    lamp: Lamp,
     places: Float32[np.ndarray, "n 3"],
     directions: Float32[np.ndarray, "n 3"],
     normals: Float32[np.ndarray, "n 3"],
 ) -> Float32[np.ndarray, " n"]:
     """Return the lamp's highlight on a glossy surface: a Phong lobe about the mirrored ray."""
     ahead, upwards, to_lamp = (
-        _normalize_vectors(a) for a in (directions, normals, _LAMP_WORLD.astype(np.float32) - places)
+        _normalize_vectors(a) for a in (directions, normals, lamp.position_world.astype(np.float32) - places)
     )
     mirrored = ahead - 2 * np.sum(ahead * upwards, axis=1, keepdims=True) * upwards
     return np.maximum(np.sum(mirrored * to_lamp, axis=1), 0) ** 90
@@ -145,15 +143,15 @@ def _normalize_vectors(vectors: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarra
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def _lamp_points(count: int) -> Float[np.ndarray, "n 3"]:
-    """Return points spread evenly (by the golden angle) over the lamp's disc, which faces the table."""
+def _lamp_points(lamp: Lamp, count: int) -> Float[np.ndarray, "n 3"]:
+    """Return points spread evenly (by the golden angle) over the lamp's disc."""
     k = np.arange(count)
-    radius, angle = _LAMP_RADIUS * np.sqrt((k + 0.5) / count), k * np.pi * (3 - np.sqrt(5))
-    down = -_LAMP_WORLD / np.linalg.norm(_LAMP_WORLD)
+    radius, angle = lamp.radius * np.sqrt((k + 0.5) / count), k * np.pi * (3 - np.sqrt(5))
+    down = -lamp.position_world / np.linalg.norm(lamp.position_world)
     side = np.cross(down, [0.0, 0.0, 1.0])
     side /= np.linalg.norm(side)
     return (
-        _LAMP_WORLD
+        lamp.position_world
         + np.outer(radius * np.cos(angle), side)
         + np.outer(radius * np.sin(angle), np.cross(down, side))
     )

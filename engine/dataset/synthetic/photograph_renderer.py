@@ -56,7 +56,7 @@ class PhotographRenderer:
     def render(self, view: SyntheticView) -> RenderedPhotograph:
         """Render the photograph of ``view`` and its ground truth."""
         height, width = self._config.height_px, self._config.width_px
-        life = self._scene.still_life
+        life = self._scene.unlit
         origins, directions = rays_world(view, self._centres_cam)
         hits = self._scene.trace(origins, directions)
         hit = hits.is_hit
@@ -90,7 +90,7 @@ class PhotographRenderer:
         return np.concatenate(parts)
 
     def _is_foreground(self, hits: TriangleHits) -> Bool[np.ndarray, " n"]:
-        return hits.is_hit & self._scene.still_life.face_is_foreground[hits.faces]
+        return hits.is_hit & self._scene.unlit.face_is_foreground[hits.faces]
 
 
 def rays_world(

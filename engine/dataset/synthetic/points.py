@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from octasplat.engine.core.color import to_bytes
 from octasplat.engine.dataset.synthetic.config import SyntheticDatasetConfig
@@ -27,12 +27,16 @@ class SurfacePoints:
     Attributes:
         xyz_world: Positions with a little noise.
         rgb_srgb8: Mean display colors of a pixel that shows them.
-        observed_px: Exact image positions of the noiseless points; not-a-number where not seen.
+        observed_points: Row of the point of each observation, ascending.
+        observing_views: Index of the view of each observation; ascending for each point.
+        observed_px: Exact image positions of the noiseless points.
     """
 
     xyz_world: Float[np.ndarray, "n 3"]
     rgb_srgb8: UInt8[np.ndarray, "n 3"]
-    observed_px: Float[np.ndarray, "n views 2"]
+    observed_points: Int[np.ndarray, " m"]
+    observing_views: Int[np.ndarray, " m"]
+    observed_px: Float[np.ndarray, "m 2"]
 
 
 def sample_surface_points(
@@ -46,7 +50,7 @@ def sample_surface_points(
     random = np.random.default_rng([config.seed, 2])
     places: list[np.ndarray] = []
     colors: list[np.ndarray] = []
-    tracks: list[np.ndarray] = []
+    tracks: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     found = 0
     for _ in range(_MAX_BATCHES):
         chosen = np.sort(random.integers(len(views), size=_BATCH))
@@ -60,7 +64,8 @@ def sample_surface_points(
         order = random.permutation(np.flatnonzero(good))[: config.points - found]
         places.append(xyz[order])
         colors.append(rgb[order])
-        tracks.append(observed[order])
+        rows, seeing = np.nonzero(np.isfinite(observed[order, :, 0]))
+        tracks.append((found + rows, seeing, observed[order[rows], seeing]))
         found += len(order)
         if found == config.points:
             break
@@ -70,7 +75,7 @@ def sample_surface_points(
     return SurfacePoints(
         xyz + random.normal(0, _POSITION_NOISE * extent, xyz.shape),
         np.concatenate(colors),
-        np.concatenate(tracks),
+        *(np.concatenate(parts) for parts in zip(*tracks, strict=True)),
     )
 
 
@@ -93,7 +98,7 @@ def _points_under_pixels(
     face = hits.faces[middle]
     selected: Bool[np.ndarray, " n"] = face >= 0
     if objects_only:
-        selected &= scene.still_life.face_is_foreground[face]
+        selected &= scene.unlit.face_is_foreground[face]
     distance = np.where(selected, hits.distances[middle], 0).astype(np.float64)
     xyz = origins[middle] + distance[:, None] * along[middle]
     return xyz[selected], to_bytes(colors[selected])

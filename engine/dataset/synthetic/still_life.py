@@ -4,14 +4,19 @@ The world is in metres with z up; the table top is the plane z = 0 around the or
 ``FLOOR_Z``, and eight walls surround both. The roof is open to a sky and to one lamp.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int32
+from jaxtyping import Float
 
 from octasplat.engine.dataset.synthetic import albedo
+from octasplat.engine.dataset.synthetic.object_scene import (
+    Lamp,
+    ObjectScene,
+    SceneObject,
+    join_objects,
+    rotation_z,
+)
 from octasplat.engine.dataset.synthetic.shapes import (
     TexturedMesh,
     boulder_mesh,
@@ -32,35 +37,8 @@ ROOM_INRADIUS = 3.6
 WALL_HEIGHT = 4.2
 
 
-@dataclass(frozen=True)
-class SceneObject:
-    """One object of the still life; ``is_foreground`` separates the table and its objects from the room."""
-
-    name: str
-    mesh: TexturedMesh
-    material: Callable[[np.ndarray, np.ndarray], np.ndarray]
-    is_foreground: bool = True
-    specular: float = 0.0
-
-
-@dataclass(frozen=True)
-class StillLife:
-    """All objects as one mesh: its ``faces`` index ``vertices``, ``face_object`` indexes ``objects``."""
-
-    objects: tuple[SceneObject, ...]
-    vertices: Float32[np.ndarray, "n 3"]
-    faces: Int32[np.ndarray, "m 3"]
-    vertex_normals: Float32[np.ndarray, "n 3"]
-    uv: Float32[np.ndarray, "n 2"]
-    texture_xyz: Float32[np.ndarray, "n 3"]
-    face_object: Int32[np.ndarray, " m"]
-    face_is_foreground: Bool[np.ndarray, " m"]
-    face_normals: Float32[np.ndarray, "m 3"]
-
-
-def _rotation_z(degrees: float) -> Float[np.ndarray, "3 3"]:
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+_LAMP = Lamp(np.array([1.9, -1.5, 4.2]), 0.4, np.array([1.0, 0.9, 0.76]) * 42.0)
+_SKY_DISTANCE = 20.0
 
 
 def _rotation_x(degrees: float) -> Float[np.ndarray, "3 3"]:
@@ -101,7 +79,7 @@ def _wall_meshes() -> TexturedMesh:
     half = ROOM_INRADIUS * np.tan(np.pi / 8)
     sides = []
     for k in range(8):
-        turn = _rotation_z(45.0 * k)
+        turn = rotation_z(45.0 * k)
         corner = turn @ [ROOM_INRADIUS, half, FLOOR_Z]
         side = flat_patch(corner, turn @ [0.0, -2 * half, 0.0], [0.0, 0.0, WALL_HEIGHT], columns=36, rows=50)
         # u is centred on the side and ten metres apart between sides, so that the material can tell them.
@@ -110,7 +88,8 @@ def _wall_meshes() -> TexturedMesh:
     return join_meshes(sides)
 
 
-def _vase_mesh() -> TexturedMesh:
+def vase_mesh() -> TexturedMesh:
+    """Return a vase of 0.51 m, open above."""
     outside = np.array(
         [
             [0.0, 0.0],
@@ -141,14 +120,14 @@ def _scene_objects() -> tuple[SceneObject, ...]:
         SceneObject("pedestal", place_mesh(_pedestal_mesh(), stand, 0.0, 0.0, FLOOR_Z), albedo.pedestal_wood),
         SceneObject(
             "vase",
-            place_mesh(_vase_mesh(), _rotation_z(20.0), -0.48, 0.36, 0.0),
+            place_mesh(vase_mesh(), rotation_z(20.0), -0.48, 0.36, 0.0),
             albedo.vase_glaze,
             specular=0.12,
         ),
         SceneObject(
             "knot",
             place_mesh(
-                torus_knot_mesh(0.078, 0.052, 420, 40), _rotation_z(35.0) @ _rotation_x(78.0), 0.42, 0.36, 0.0
+                torus_knot_mesh(0.078, 0.052, 420, 40), rotation_z(35.0) @ _rotation_x(78.0), 0.42, 0.36, 0.0
             ),
             albedo.knot_glaze,
             specular=0.3,
@@ -156,47 +135,29 @@ def _scene_objects() -> tuple[SceneObject, ...]:
         SceneObject(
             "tower",
             place_mesh(
-                twisted_tower_mesh(0.125, 0.66, np.radians(70), 0.62, 24), _rotation_z(10.0), 0.02, -0.06, 0.0
+                twisted_tower_mesh(0.125, 0.66, np.radians(70), 0.62, 24), rotation_z(10.0), 0.02, -0.06, 0.0
             ),
             albedo.tower_bricks,
         ),
         SceneObject(
             "boulder",
-            place_mesh(boulder_mesh(0.21, 0.28, 160, 110), _rotation_z(0.0), 0.5, -0.36, 0.0),
+            place_mesh(boulder_mesh(0.21, 0.28, 160, 110), rotation_z(0.0), 0.5, -0.36, 0.0),
             albedo.boulder_stone,
         ),
         SceneObject(
             "cube",
-            place_mesh(superquadric_mesh(0.15, 7.0, 128, 96), _rotation_z(28.0), -0.34, -0.46, 0.0),
+            place_mesh(superquadric_mesh(0.15, 7.0, 128, 96), rotation_z(28.0), -0.34, -0.46, 0.0),
             albedo.cube_paint,
         ),
         SceneObject(
             "book",
-            place_mesh(box_mesh((0.32, 0.44, 0.07), 16), _rotation_z(-62.0), -0.02, 0.62, 0.0),
+            place_mesh(box_mesh((0.32, 0.44, 0.07), 16), rotation_z(-62.0), -0.02, 0.62, 0.0),
             albedo.book_cloth,
         ),
     )
 
 
 @lru_cache(maxsize=1)
-def build_still_life() -> StillLife:
-    """Build the scene that is photographed; it has no parameters and is always the same."""
-    scene_objects = _scene_objects()
-    joined = join_meshes([scene_object.mesh for scene_object in scene_objects])
-    counts = [len(scene_object.mesh.faces) for scene_object in scene_objects]
-    corners = joined.vertices.astype(np.float64)[joined.faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    face_object = np.repeat(np.arange(len(scene_objects), dtype=np.int32), counts)
-    return StillLife(
-        objects=scene_objects,
-        vertices=joined.vertices,
-        faces=joined.faces,
-        vertex_normals=joined.normals,
-        uv=joined.uv,
-        texture_xyz=joined.texture_xyz,
-        face_object=face_object,
-        face_is_foreground=np.array([scene_object.is_foreground for scene_object in scene_objects])[
-            face_object
-        ],
-        face_normals=(across / np.linalg.norm(across, axis=1, keepdims=True)).astype(np.float32),
-    )
+def build_still_life() -> ObjectScene:
+    """Build the still life; it has no parameters and is always the same."""
+    return join_objects(_scene_objects(), _LAMP, _SKY_DISTANCE)

@@ -12,6 +12,9 @@ from octasplat.engine.dataset.synthetic.config import SyntheticDatasetConfig
 _RINGS = ((0.4, 2.45, 0.5), (0.35, 2.25, 1.05), (0.25, 1.75, 1.75))
 _TARGET_WORLD = np.array([0.0, 0.0, 0.16])
 _HALF_FOV = np.radians(27)
+# Of the walks along the street: directions of a station in degrees from +x to the other side, and pitches.
+_YAWS, _PITCHES = (20.0, 65.0, 115.0, 160.0), (3.0, 14.0)
+_WALK_HALF_LENGTH = 52.0
 
 
 @dataclass(frozen=True)
@@ -46,7 +49,12 @@ def synthetic_camera(config: SyntheticDatasetConfig) -> pycolmap.Camera:
 
 
 def synthetic_views(config: SyntheticDatasetConfig) -> list[SyntheticView]:
-    """Return all views, ring by ring from the lowest; each looks at about the middle of the still life."""
+    """Return all views of the scene that ``config`` names."""
+    return _street_views(config) if config.scene == "street" else _table_views(config)
+
+
+def _table_views(config: SyntheticDatasetConfig) -> list[SyntheticView]:
+    """Return the views ring by ring from the lowest; each looks at about the middle of the still life."""
     random = np.random.default_rng([config.seed, 1])
     ends = np.round(np.cumsum([share for share, _, _ in _RINGS]) * config.views).astype(int)
     counts = np.diff(ends, prepend=0)
@@ -59,18 +67,46 @@ def synthetic_views(config: SyntheticDatasetConfig) -> list[SyntheticView]:
                 [reach * np.cos(angle), reach * np.sin(angle), height + random.uniform(-0.12, 0.12)]
             )
             ahead = _TARGET_WORLD + random.uniform(-0.06, 0.06, 3) - centre
-            ahead /= np.linalg.norm(ahead)
-            right = np.cross(ahead, [0.0, 0.0, 1.0])
-            right /= np.linalg.norm(right)
-            roll = random.uniform(-0.03, 0.03)
-            down = np.cross(ahead, right)
-            right, down = (
-                np.cos(roll) * right + np.sin(roll) * down,
-                np.cos(roll) * down - np.sin(roll) * right,
-            )
-            rotation = np.stack([right, down, ahead])
-            made.append(SyntheticView(f"view_{len(made):03d}.png", rotation, -rotation @ centre))
+            made.append(_view_towards(len(made), config.views, centre, ahead, random.uniform(-0.03, 0.03)))
     return made
+
+
+def _street_views(config: SyntheticDatasetConfig) -> list[SyntheticView]:
+    """Return the views of two walks along the street, each looking at the other side, straight and aslant.
+
+    Stations follow each other along x, and so do the names.
+    """
+    random = np.random.default_rng([config.seed, 1])
+    each = len(_YAWS)
+    stations = -(-config.views // (2 * each))
+    made: list[SyntheticView] = []
+    for station in range(stations):
+        for lane in (-1.0, 1.0):
+            x = _WALK_HALF_LENGTH * ((2 * station + 1 + 0.5 * lane) / stations - 1)
+            y = lane * random.uniform(2.1, 2.7)
+            centre = np.array([x + random.uniform(-0.2, 0.2), y, random.uniform(1.5, 1.8)])
+            for place, yaw in enumerate(_YAWS):
+                angle = np.radians(yaw + random.uniform(-4, 4))
+                rise = np.tan(np.radians(_PITCHES[(place + station) % 2] + random.uniform(-2, 2)))
+                ahead = np.array([np.cos(angle), -lane * np.sin(angle), rise])
+                if len(made) < config.views:
+                    roll = random.uniform(-0.02, 0.02)
+                    made.append(_view_towards(len(made), config.views, centre, ahead, roll))
+    return made
+
+
+def _view_towards(
+    number: int, count: int, centre: Float[np.ndarray, "3"], ahead: Float[np.ndarray, "3"], roll: float
+) -> SyntheticView:
+    """Return the view ``number`` of ``count`` from ``centre`` along ``ahead``, turned by ``roll`` radians."""
+    ahead = ahead / np.linalg.norm(ahead)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    down = np.cross(ahead, right)
+    right, down = np.cos(roll) * right + np.sin(roll) * down, np.cos(roll) * down - np.sin(roll) * right
+    rotation = np.stack([right, down, ahead])
+    digits = max(3, len(str(count - 1)))
+    return SyntheticView(f"view_{number:0{digits}d}.png", rotation, -rotation @ centre)
 
 
 def directions_cam(camera: pycolmap.Camera, pixels: Float[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n 3"]:

@@ -11,19 +11,22 @@ from octasplat.engine.dataset.synthetic.lit_scene import THREADS, LitScene
 from octasplat.engine.dataset.synthetic.photograph_renderer import PhotographRenderer
 from octasplat.engine.dataset.synthetic.points import sample_surface_points
 from octasplat.engine.dataset.synthetic.still_life import build_still_life
+from octasplat.engine.dataset.synthetic.street import build_street
+
+_BUILDERS = {"still_life": build_still_life, "street": build_street}
 
 
 @lru_cache(maxsize=1)
-def cached_lit_scene() -> LitScene:
-    """Return the lit still life; cached, because lighting it takes longer than a photograph."""
-    return LitScene(build_still_life())
+def cached_lit_scene(name: str) -> LitScene:
+    """Return the lit scene of a name; cached, because lighting it takes longer than a photograph."""
+    return LitScene(_BUILDERS[name]())
 
 
 def write_dataset_files(
     root: Path, config: SyntheticDatasetConfig, progress: Callable[[int, int], None]
 ) -> None:
     """Write images, model and ground truth under ``root``; ``progress`` counts photographs."""
-    scene = cached_lit_scene()
+    scene = cached_lit_scene(config.scene)
     camera, views = synthetic_views.synthetic_camera(config), synthetic_views.synthetic_views(config)
     truth = root / "ground_truth"
     folders = [root / "images", truth / "depth", truth / "normals", truth / "masks"]
@@ -41,7 +44,7 @@ def write_dataset_files(
         if config.with_masks:
             files.write_mask(root / "masks" / f"{view.name}.png", photograph.is_foreground)
 
-    files.write_mesh(truth / "mesh.ply", scene.still_life.vertices, scene.still_life.faces)
+    files.write_mesh(truth / "mesh.ply", scene.unlit.vertices, scene.unlit.faces)
     colmap_writer.write_model(
         root / "sparse" / "0", camera, views, sample_surface_points(scene, camera, views, config)
     )

@@ -1,7 +1,7 @@
 """``octasplat demo``: the whole way on a scene that octasplat makes itself."""
 
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 import click
 from pydantic import Field
@@ -17,7 +17,7 @@ from octasplat.workers.cli.request_options import request_from_options, request_
 
 
 class DemoRequest(Request):
-    """Make photographs of a still life, reconstruct them and open the report; takes a few minutes.
+    """Make photographs of a scene, reconstruct them and open the report; takes a few minutes.
 
     The same command goes on where it was interrupted.
     """
@@ -29,6 +29,10 @@ class DemoRequest(Request):
         False, description="Only write the photographs and their poses, right into the output folder."
     )
     preset: PresetName = Field("fast", description="Settings of the reconstruction.")
+    scene: Literal["still_life", "street"] = Field(
+        "still_life",
+        description="What is photographed: a still life on a table, or a street of 112 m for many views.",
+    )
     views: Annotated[int | None, Spelling(metavar="N")] = Field(None, description="Number of photographs.")
     width_px: Annotated[int | None, Unit("px"), Spelling(("--width",), metavar="PX")] = Field(
         None, description="Width of the photographs."
@@ -51,13 +55,13 @@ def demo(open_report: bool | None, threads: int, printer: Printer, **given: Any)
 
     request: DemoRequest = request_from_options(DemoRequest, given)
     output = request.output
-    size = {"views": request.views, "width_px": request.width_px, "height_px": request.height_px}
+    given_scene = request.model_dump(include={"scene", "views", "width_px", "height_px"})
     if request.dataset_only:
-        make_demo_scene(output, size, quiet=printer.hides_progress)
+        make_demo_scene(output, given_scene, quiet=printer.hides_progress)
         how = f"octasplat reconstruct {output} -o OUT"
         printer.print({"dataset": output}, [f"The dataset is in {output}; reconstruct it with: {how}"])
         return
-    make_demo_scene(output / "scene", size, quiet=printer.hides_progress)
+    make_demo_scene(output / "scene", given_scene, quiet=printer.hides_progress)
     report = reconstruct_demo_scene(
         output / "scene", output / "result", request.preset, printer, threads=threads
     )

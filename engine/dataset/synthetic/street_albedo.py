@@ -1,0 +1,149 @@
+"""Albedo of a street: houses, roofs, ground and trees; arguments as in :mod:`.albedo`."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from octasplat.engine.dataset.synthetic.albedo import Colors, TexturePoints, UvCoordinates
+from octasplat.engine.dataset.synthetic.patterns import (
+    box_mask,
+    cell_noise,
+    gradient_noise,
+    grey_column,
+    grid_lines,
+    lerp,
+    linear_from_hex,
+    scale_points,
+    smoothstep,
+    text_mask,
+)
+
+SIDE_STEP = 100.0
+"""By so much u of a house's walls differs from side to side; the first side faces the street."""
+WINDOW_STEP, STOREY = 2.2, 3.0
+"""Metres from window to window, along and up."""
+_PLASTERS = ("d9c3a0", "b7c4c9", "c98d6b", "e3ddcf", "9fae8c", "d8b46a", "a9929f", "c7b7a3")
+_FRAMES = ("f4f1ea", "3c4a3e", "5b3a29", "dfe6ea")
+_SIGNS = ("OCTAGON", "SPLAT", "GALLERIA", "PASTA", "CEREAL", "REGAL", "ORIGINAL", "LOGIC")
+
+
+def facade(number: int, storeys: int) -> Callable[[TexturePoints, UvCoordinates], Colors]:
+    """Return the material of the walls of a house: plaster or bricks, windows, a door and a sign.
+
+    Walls are whole window steps wide, so that no window is cut; above the storeys there are none.
+    """
+    body, frame = linear_from_hex(_PLASTERS[number % 8]), linear_from_hex(_FRAMES[number % 4])
+    is_brick = number % 3 == 1
+
+    def material(xyz: TexturePoints, uv: UvCoordinates) -> Colors:
+        side = np.floor(uv[:, 0] / SIDE_STEP)
+        u, v = uv[:, 0] - SIDE_STEP * side, uv[:, 1]
+        stain = gradient_noise(scale_points(xyz, (0.9, 0.9, 0.5)), octaves=4, seed=100 + number)
+        grain = gradient_noise(xyz * np.float32(9), octaves=3, seed=200 + number)
+        colors = np.broadcast_to(body, xyz.shape) * grey_column(0.86 + 0.24 * stain + 0.16 * grain)
+        if is_brick:
+            colors = _bricks(u, v, colors, number)
+        base = box_mask(v, 0.0, 0.6)
+        colors = lerp(colors, linear_from_hex("77716a") * grey_column(0.9 + 0.4 * grain), base)
+        colors = _windows(colors, u, np.where(v < STOREY * storeys, v, 0), side, frame, number)
+        is_front = (side == 0).astype(np.float32)
+        door = box_mask(u, 5.0, 6.2) * box_mask(v, 0.0, 2.3) * is_front
+        panel = grid_lines(u / 0.6 - 0.333, v / 1.15, 0.14)
+        wood = lerp(linear_from_hex(("7a2e25", "274156", "3f5a36")[number % 3]), frame, 0.8 * panel)
+        colors = lerp(colors, wood * grey_column(0.9 + 0.3 * grain), door)
+        board = box_mask(u, 3.4, 7.8) * box_mask(v, 2.5, 2.95) * is_front
+        word = _SIGNS[number % len(_SIGNS)]
+        start = 5.6 - 0.25 * len(word)
+        ink = text_mask((u - start) / 0.5, (v - 2.9) / 0.5, [word]) * box_mask(
+            u, start, start + 0.5 * len(word)
+        )
+        sign = lerp(linear_from_hex("20303c"), linear_from_hex("f3d27a"), ink)
+        return lerp(colors, sign, board)
+
+    return material
+
+
+def _bricks(u: np.ndarray, v: np.ndarray, colors: Colors, number: int) -> Colors:
+    course = v / 0.12
+    along = u / 0.3 + 0.5 * np.mod(np.floor(course), 2)
+    tone = cell_noise(along, course, seed=number)
+    colors = colors * grey_column(0.7 + 0.5 * tone)
+    mortar = np.maximum(box_mask(np.mod(course, 1), 0.0, 0.14), box_mask(np.mod(along, 1), 0.0, 0.06))
+    return lerp(colors, linear_from_hex("c9c1b2"), 0.7 * mortar)
+
+
+def _windows(
+    colors: Colors, u: np.ndarray, v: np.ndarray, side: np.ndarray, frame: np.ndarray, number: int
+) -> Colors:
+    """Return the wall with windows: frame, bars, panes that are darker above, some with curtains."""
+    across, up = np.mod(u, WINDOW_STEP), np.mod(v, STOREY)
+    outside = box_mask(across, 0.5, 1.7) * box_mask(up, 0.95, 2.45)
+    inside = box_mask(across, 0.6, 1.6) * box_mask(up, 1.05, 2.35)
+    tone = cell_noise(u / WINDOW_STEP, v / STOREY + 7 * side, seed=300 + number)
+    glass = lerp(linear_from_hex("5d7386"), linear_from_hex("1d2730"), (up - 1.05) / np.float32(1.3))
+    glass = glass * grey_column(0.7 + 0.6 * tone)
+    folds = 0.75 + 0.25 * np.sin(55 * across)
+    curtain = linear_from_hex("e6dcc6") * grey_column(folds)
+    drawn = (tone > 0.55) * (np.abs(across - 1.1) > 0.5 * (1.25 - tone))
+    glass = lerp(glass, curtain, drawn.astype(np.float32))
+    bars = np.maximum(box_mask(across, 1.07, 1.13), box_mask(up, 1.85, 1.91))
+    glass = lerp(glass, frame, bars)
+    colors = lerp(colors, frame, outside)
+    colors = lerp(colors, glass, inside)
+    sill = box_mask(across, 0.4, 1.8) * box_mask(up, 0.86, 0.95)
+    return lerp(colors, linear_from_hex("a8a196"), sill)
+
+
+def roof_tiles(number: int) -> Callable[[TexturePoints, UvCoordinates], Colors]:
+    """Return the material of a roof: rows of rounded tiles of changing tone."""
+    light, dark = (("b5573a", "6f2f22"), ("6d7278", "3b4046"), ("8a6a4a", "4c3826"))[number % 3]
+
+    def material(xyz: TexturePoints, uv: UvCoordinates) -> Colors:
+        row = uv[:, 1] / 0.28
+        place = uv[:, 0] / 0.22 + 0.5 * np.mod(np.floor(row), 2)
+        tone = cell_noise(place, row, seed=400 + number)
+        moss = gradient_noise(xyz * np.float32(0.8), octaves=4, seed=500 + number)
+        colors = lerp(linear_from_hex(light), linear_from_hex(dark), np.clip(tone, 0, 1))
+        colors = lerp(colors, linear_from_hex("6b7440"), 0.6 * smoothstep(0.2, 0.45, moss))
+        bow = np.abs(np.mod(place, 1) - 0.5)
+        edge = (np.mod(row, 1) < 0.22 + 0.9 * bow * bow).astype(np.float32)
+        return colors * grey_column(1 - 0.5 * edge)
+
+    return material
+
+
+def street_ground(xyz: TexturePoints, uv: UvCoordinates) -> Colors:
+    """Return the albedo of the ground: asphalt with marks, kerbs, paved ways, and grass behind."""
+    x, y = xyz[:, 0], np.abs(xyz[:, 1])
+    fine = gradient_noise(xyz * np.float32(14), octaves=3, seed=71)
+    wide = gradient_noise(xyz * np.float32(0.5), octaves=4, seed=72)
+    colors = linear_from_hex("5d5d60") * grey_column(0.85 + 0.5 * fine + 0.4 * wide)
+    patch = cell_noise(x / 7.3, xyz[:, 1] / 2.1, seed=73)
+    colors = colors * grey_column(np.where(patch > 0.8, 0.62, 1.0))
+    dashes = box_mask(y, 0.0, 0.08) * box_mask(np.mod(x, 4.0), 0.0, 2.0)
+    colors = lerp(colors, linear_from_hex("e8e4d8"), dashes * np.clip(0.9 + 0.8 * fine, 0, 1))
+    crossing = box_mask(np.mod(x, 28.0), 12.0, 15.0) * box_mask(np.mod(y + 0.3, 1.2), 0.0, 0.6)
+    colors = lerp(colors, linear_from_hex("ded9cb"), crossing * box_mask(y, 0.0, 3.4))
+    slabs = linear_from_hex("a49c8e") * grey_column(
+        0.75 + 0.4 * cell_noise(x / 0.6, xyz[:, 1] / 0.6, seed=74) + 0.3 * fine
+    )
+    slabs = lerp(slabs, linear_from_hex("5f5a52"), grid_lines(x / 0.6, xyz[:, 1] / 0.6, 0.05))
+    colors = lerp(colors, slabs, box_mask(y, 3.6, 7.0))
+    kerb = linear_from_hex("c4beb2") * grey_column(0.9 + 0.3 * cell_noise(x / 1.1, y * 0, seed=75))
+    colors = lerp(colors, kerb, box_mask(y, 3.4, 3.6))
+    blades = gradient_noise(scale_points(xyz, (5.0, 5.0, 5.0)), octaves=4, seed=76)
+    grass = lerp(linear_from_hex("5d7a33"), linear_from_hex("a59a5a"), np.clip(0.4 + blades + wide, 0, 1))
+    return lerp(colors, grass, (y >= 7.0).astype(np.float32))
+
+
+def leaves(number: int) -> Callable[[TexturePoints, UvCoordinates], Colors]:
+    """Return the material of a crown of leaves."""
+    light, dark = (("8fa845", "2f4a1c"), ("b3a03a", "5a5a1e"), ("6f9a4f", "23401f"))[number % 3]
+
+    def material(xyz: TexturePoints, uv: UvCoordinates) -> Colors:
+        clumps = gradient_noise(xyz * np.float32(2.2), octaves=2, seed=600 + number)
+        leaf = gradient_noise(xyz * np.float32(11), octaves=3, seed=700 + number)
+        colors = lerp(linear_from_hex(dark), linear_from_hex(light), np.clip(0.45 + 0.9 * leaf, 0, 1))
+        return colors * grey_column(0.8 + 0.6 * clumps)
+
+    return material
