@@ -53,6 +53,11 @@ def plan_from_points(
             f"The model in {model.model_folder} has no points that photographs show, by which blocks are "
             "planned; reconstruct cuts by its coarse scene."
         )
+    # Sorted once, so that the observations of a view are one slice.
+    order = np.argsort(view, kind="stable")
+    rows, xy_px = rows[order], xy_px[order]
+    starts = np.searchsorted(view[order], np.arange(len(model.views) + 1))
+    slices = [(index, slice(starts[index], starts[index + 1])) for index in train_indices.tolist()]
     points = model.points.xyz_world.astype(np.float64)
     weights = np.bincount(rows, minlength=len(points)).astype(np.float64)
     found = []
@@ -60,10 +65,7 @@ def plan_from_points(
         inside = box.contains(points) & (weights > 0)
         margin_world = MARGIN * weighted_spread(points[inside], weights[inside])
         member = box.grown(margin_world).contains(points)
-        pixels = [
-            _pixels_of_view(model, index, xy_px[view == index], member[rows[view == index]])
-            for index in train_indices.tolist()
-        ]
+        pixels = [_pixels_of_view(model, index, xy_px[of], member[rows[of]]) for index, of in slices]
         shown, drawn = np.array(pixels).sum(axis=0)
         view_count = int(np.count_nonzero([shown_px for shown_px, _ in pixels]))
         share = float(weights[member].sum() / weights.sum())

@@ -12,11 +12,15 @@ from typing import Any, TypeVar
 
 import numpy as np
 import pycolmap
+from jaxtyping import Float64, Int64
 
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.dataset.colmap_records import CameraRecord, ImageRecord, ModelRecords, PointRecord
 
 _Record = TypeVar("_Record")
+Observations = tuple[Float64[np.ndarray, "k 2"], Int64[np.ndarray, " k"]]
+"""Positions in an image and ids of the points that are seen there."""
+_NO_POINT = -1
 
 
 def check_binary_colmap_model(folder: Path) -> None:
@@ -66,6 +70,16 @@ def read_binary_model(folder: Path) -> ModelRecords:
     return ModelRecords(cameras, images, points, tuple(rigs * has_rigs))
 
 
+def read_binary_observations(path: Path) -> dict[int, Observations]:
+    """Return the observations of points in a whole ``images.bin``, by the ids of their images."""
+    data, found = path.read_bytes(), {}
+    for position, _, values in _image_records(data):
+        shown = values[values["point"] != _NO_POINT]
+        (image_id,) = _unpack("I", data, position)
+        found[image_id] = (shown["px"].astype(np.float64), shown["point"].astype(np.int64))
+    return found
+
+
 def _by_id(
     path: Path, read: Callable[[Any, Path], Iterator[tuple[int, _Record]]], what: str
 ) -> dict[int, _Record]:
@@ -89,13 +103,21 @@ def _read_cameras(data: bytes, path: Path) -> Iterator[tuple[int, CameraRecord]]
         yield camera_id, CameraRecord(camera_id, names[model], width, height, params)
 
 
-def _read_images(data: bytes, path: Path) -> Iterator[tuple[int, ImageRecord]]:
+def _image_records(data: bytes) -> Iterator[tuple[int, int, Any]]:
+    """Yield where each image begins, where its name ends, and its rows of ``px`` and ``point``."""
     shown = np.dtype([("px", "<f8", 2), ("point", "<i8")])
     position = 8
     for _ in range(_unpack("Q", data, 0)[0]):
+        end_of_name = data.index(b"\0", position + 64)
+        (count,) = _unpack("Q", data, end_of_name + 1)
+        yield position, end_of_name, np.frombuffer(data, shown, count, end_of_name + 9)
+        position = end_of_name + 9 + shown.itemsize * count
+
+
+def _read_images(data: bytes, path: Path) -> Iterator[tuple[int, ImageRecord]]:
+    for position, end_of_name, values in _image_records(data):
         # IMAGE_ID, rotation, translation, CAMERA_ID
         image_id, *numbers, camera_id = _unpack("I7dI", data, position)
-        end_of_name = data.index(b"\0", position + 64)
         try:
             name = data[position + 64 : end_of_name].decode()
         except UnicodeDecodeError:
@@ -103,9 +125,6 @@ def _read_images(data: bytes, path: Path) -> Iterator[tuple[int, ImageRecord]]:
                 f"{path} names image {image_id} otherwise than in UTF-8; rename the photograph in plain "
                 "letters and run COLMAP again."
             ) from None
-        (count,) = _unpack("Q", data, end_of_name + 1)
-        values = np.frombuffer(data, shown, count, end_of_name + 9)
-        position = end_of_name + 9 + shown.itemsize * count
         yield (
             image_id,
             ImageRecord(

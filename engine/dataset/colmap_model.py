@@ -15,6 +15,7 @@ from jaxtyping import Float64, Int64
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.local_origin import NO_ORIGIN, Origin, choose_origin
 from octasplat.engine.dataset.camera import Camera
+from octasplat.engine.dataset.colmap_binary import Observations
 from octasplat.engine.dataset.colmap_reading import LoadedModel, load_model
 from octasplat.engine.dataset.model import SparsePoints
 from octasplat.engine.dataset.pose_check import check_poses
@@ -110,7 +111,7 @@ def colmap_model_of(loaded: LoadedModel, folder: Path, *, origin_world: Origin |
     """
     reconstruction, warnings = loaded.reconstruction, list(loaded.notes)
     _normalise_quaternions(reconstruction, folder, warnings)
-    images = _posed_images(reconstruction, folder, warnings)
+    images = _posed_images(loaded, folder, warnings)
     cameras = _convert_cameras(reconstruction, {image.camera_id for image in images}, folder, warnings)
     columns = _point_columns(reconstruction)
     points_world = columns["xyz"]
@@ -189,10 +190,10 @@ def _quaternion_wxyz(pose: Any) -> str:
     return f"({w:g}, {x:g}, {y:g}, {z:g})"
 
 
-def _posed_images(reconstruction: Any, folder: Path, warnings: list[str]) -> tuple[PosedImage, ...]:
+def _posed_images(loaded: LoadedModel, folder: Path, warnings: list[str]) -> tuple[PosedImage, ...]:
     images: list[PosedImage] = []
     unposed = 0
-    for image in reconstruction.images.values():
+    for image in loaded.reconstruction.images.values():
         if not image.has_pose:
             unposed += 1
             continue
@@ -201,16 +202,10 @@ def _posed_images(reconstruction: Any, folder: Path, warnings: list[str]) -> tup
             raise DatasetError(
                 f"The pose of {image.name} in {folder} is not a finite rigid motion; run COLMAP again."
             )
-        observed = image.get_observation_points2D()
-        coordinates = (value for point in observed for value in (point.x(), point.y()))
-        observed_px = np.fromiter(coordinates, np.float64, 2 * len(observed)).reshape(-1, 2)
-        point_ids = np.fromiter((point.point3D_id for point in observed), np.uint64, len(observed))
-        # Beyond what a signed number holds lies only COLMAP's mark for none.
-        observed_points = point_ids.astype(np.int64)
+        known = loaded.observations
+        observed = _observations(image) if known is None else known[image.image_id]
         pose = matrix[:, :3].copy(), matrix[:, 3].copy()
-        images.append(
-            PosedImage(_image_name(image, folder), int(image.camera_id), *pose, observed_px, observed_points)
-        )
+        images.append(PosedImage(_image_name(image, folder), int(image.camera_id), *pose, *observed))
     if unposed:
         warnings.append(f"{unposed} images of the model in {folder} have no pose and are left out.")
     names = Counter(image.name for image in images)
@@ -221,6 +216,16 @@ def _posed_images(reconstruction: Any, folder: Path, warnings: list[str]) -> tup
             "each or run COLMAP again."
         )
     return tuple(sorted(images, key=lambda image: image.name))
+
+
+def _observations(image: Any) -> Observations:
+    """Return the observations of an image of pycolmap."""
+    observed = image.get_observation_points2D()
+    coordinates = (value for point in observed for value in (point.x(), point.y()))
+    observed_px = np.fromiter(coordinates, np.float64, 2 * len(observed)).reshape(-1, 2)
+    point_ids = np.fromiter((point.point3D_id for point in observed), np.uint64, len(observed))
+    # Beyond what a signed number holds lies only COLMAP's mark for none.
+    return observed_px, point_ids.astype(np.int64)
 
 
 def _image_name(image: Any, folder: Path) -> str:

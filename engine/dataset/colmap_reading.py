@@ -8,7 +8,12 @@ from typing import Any
 import pycolmap
 
 from octasplat.engine.core.errors import DatasetError
-from octasplat.engine.dataset.colmap_binary import check_binary_colmap_model, read_binary_model
+from octasplat.engine.dataset.colmap_binary import (
+    Observations,
+    check_binary_colmap_model,
+    read_binary_model,
+    read_binary_observations,
+)
 from octasplat.engine.dataset.colmap_records import ModelRecords, build_reconstruction
 from octasplat.engine.dataset.colmap_text import is_plain_text_model, read_text_model
 from octasplat.engine.dataset.image_names import match_image_names
@@ -28,6 +33,7 @@ class LoadedModel:
         held_out: names of the images that the files hold out; None where they do not say.
         masks: paths of masks, by the names of their images.
         depths: paths of depth maps, likewise.
+        observations: by the ids of images, where they were read without pycolmap, which gives one at a time.
     """
 
     reconstruction: Any
@@ -35,6 +41,7 @@ class LoadedModel:
     held_out: tuple[str, ...] | None = None
     masks: Mapping[str, str] = field(default_factory=dict)
     depths: Mapping[str, str] = field(default_factory=dict)
+    observations: Mapping[int, Observations] | None = None
 
 
 def load_model(path: Path, sizes_px: Mapping[str, tuple[int, int]] | None = None) -> LoadedModel:
@@ -59,7 +66,8 @@ def load_model(path: Path, sizes_px: Mapping[str, tuple[int, int]] | None = None
     is_binary = all((path / f"{part}.bin").is_file() for part in MODEL_FILES)
     if is_binary or is_plain_text_model(path):
         try:
-            return LoadedModel(pycolmap.Reconstruction(str(path)))
+            observations = read_binary_observations(path / "images.bin") if is_binary else None
+            return LoadedModel(pycolmap.Reconstruction(str(path)), observations=observations)
         except (ValueError, IndexError, KeyError, TypeError, RuntimeError, OSError):
             pass  # read again with care, which says where it stops
     records = read_binary_model(path) if is_binary else read_text_model(path)

@@ -16,7 +16,7 @@ def photograph_sizes(scene: Path) -> list[ImageSizes]:
     from octasplat.engine.dataset.photograph_files import image_folder
     from octasplat.engine.poses.photographs import photographs_of_scene
 
-    names = photographs_of_scene(scene)
-    infos = [read_image_info(image_folder(scene) / name) for name in names]
+    folder = image_folder(scene)
+    infos = [read_image_info(folder / name) for name in photographs_of_scene(scene)]
     counts = Counter((info.width_px, info.height_px) for info in infos)
     return [ImageSizes(width, height, count) for (width, height), count in counts.items()]
