@@ -1,6 +1,6 @@
 """Datasets with their pixels: rays and colors of any pixels of any views."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -8,7 +8,6 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32, Int, Int64
 
-from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.local_origin import NO_ORIGIN, Origin
 from octasplat.engine.core.rays import ImageRays, RayBatch
 from octasplat.engine.dataset.camera import Camera
@@ -20,16 +19,18 @@ from octasplat.engine.dataset.depth_maps import (
     fit_unit,
     open_depth_maps,
 )
+from octasplat.engine.dataset.image_info import ImageInfo, Storage
+from octasplat.engine.dataset.images import ValueScale
 from octasplat.engine.dataset.kernels import gather
 from octasplat.engine.dataset.known_geometry import KnownGeometry
-from octasplat.engine.dataset.load import load_dataset_model
+from octasplat.engine.dataset.load import load_dataset_model, require_masks
 from octasplat.engine.dataset.model import DatasetModel, DatasetView, Observations, SparsePoints, Viewpoints
 from octasplat.engine.dataset.pixel_cache import PixelCache, file_digests, open_pixel_cache
 from octasplat.engine.dataset.ray_tables import (
     MAX_TABLE_BYTES,
     RayTables,
+    iterate_row_blocks,
     open_ray_tables,
-    rows_per_block,
 )
 from octasplat.engine.dataset.region import Region, region_pixels
 from octasplat.engine.dataset.scene_split import SceneSplit, SplitRule, SplitSource, split_scene
@@ -73,6 +74,10 @@ class Dataset:
         trained_pixels: how often each pixel is drawn where there is a region; None stands for evenly.
         has_alpha: whether any pixel can have an alpha below 1.
         has_masks: whether any view has a mask.
+        has_stored_alpha: whether the alpha of any photograph is below 1 anywhere, whatever masks say.
+        image_infos: headers of the photographs.
+        value_scales: see :mod:`octasplat.engine.dataset.value_scale`.
+        depth_maps: None where there are none.
         has_known_distances: whether any view has a depth map, or geometry is known.
         extent: radius of the training cameras, see :func:`octasplat.engine.dataset.model.scene_extent`.
         near_world: distance from the cameras at which anything is seen: ``near`` of the extent, but at most
@@ -112,12 +117,15 @@ class Dataset:
         )
         self.observations: Observations = model.observations
         self.views_record: ViewsRecord = views_record(model, cache.digests, self.test_indices, depths_sha256)
-        self._depth_maps = depth_maps
+        self.depth_maps: DepthMaps | None = depth_maps
         self._axes_world = np.stack([view.rotation_cam_from_world[2] for view in model.views])
         self.has_known_distances: bool = depth_maps is not None
         self.has_masks: bool = len(cache.mask.values) > 0
         self._mask_is_alpha = masks == "alpha"
-        self.has_alpha: bool = len(cache.alpha.values) > 0 or (self._mask_is_alpha and self.has_masks)
+        self.has_stored_alpha: bool = len(cache.alpha.values) > 0
+        self.has_alpha: bool = self.has_stored_alpha or (self._mask_is_alpha and self.has_masks)
+        self.image_infos: tuple[ImageInfo, ...] = model.image_infos
+        self.value_scales: Mapping[Storage, ValueScale] = cache.scales
         self._cache = cache
         self._view_rays = ViewRays(model, tables)
         self.warnings += self._view_rays.warnings
@@ -194,7 +202,8 @@ class Dataset:
         scene = load_dataset_model(
             root, max_side=max_side, model_folder=model_folder, model=model, origin_world=origin_world
         )
-        _require_masks(scene, root, masks)
+        if masks == "alpha":
+            require_masks(scene)
         # Fail before the expensive decoding.
         rule = SplitRule(test_every, held_out, burst_length, split, stored_split)
         parts = split_scene(scene, rule)
@@ -252,7 +261,8 @@ class Dataset:
         scene = load_dataset_model(
             root, max_side=max_side, min_views=1, for_training=False, origin_world=origin_world
         )
-        _require_masks(scene, root, masks)
+        if masks == "alpha":
+            require_masks(scene)
         cache = open_pixel_cache(scene, cache_dir, threads=threads, progress=progress)
         tables = open_ray_tables(scene.cameras, cache_dir, MAX_TABLE_BYTES)
         return cls(scene, cache, tables, masks=masks, near_world=near_world)
@@ -298,9 +308,10 @@ class Dataset:
         """Return straight display colors and alpha in [0, 1], and weights: 1, or 0 for invalid pixels.
 
         Raises:
-            IndexError: a pixel does not exist.
+            IndexError: a pixel does not exist, or was not opened.
         """
         view, y, x = as_int64(view), as_int64(y), as_int64(x)
+        self._cache.require(view)
         rgb = np.empty((len(view), 3), dtype=np.float32)
         alpha = np.empty(len(view), dtype=np.float32)
         weight = np.empty(len(view), dtype=np.float32)
@@ -325,10 +336,10 @@ class Dataset:
         Raises:
             IndexError: a pixel does not exist.
         """
-        if self._depth_maps is None:
+        if self.depth_maps is None:
             return np.zeros(len(view), np.float32)
         view, y, x = as_int64(view), as_int64(y), as_int64(x)
-        depth = self._depth_maps.z_world(view, y, x, self._view_rays.sizes)
+        depth = self.depth_maps.z_world(view, y, x, self._view_rays.sizes)
         _, directions = self._view_rays.trace(view, y, x)
         along = np.einsum("nk,nk->n", directions, self._axes_world[view])
         # pixels of weight 0 and rays beside or behind the plane of the camera know nothing
@@ -339,7 +350,7 @@ class Dataset:
         """Return all rays of one view."""
         width, height = self._view_size(view_index)
         directions = np.empty((height * width, 3), dtype=np.float32)
-        for pixels, view, y, x in _iterate_row_blocks(view_index, width, height):
+        for pixels, view, y, x in iterate_row_blocks(view_index, width, height):
             directions[pixels] = self.rays(view, y, x).directions_world
         return ImageRays(
             RayBatch(self._view_rays.origins_world[[view_index]], directions, self.near_world), height, width
@@ -353,7 +364,7 @@ class Dataset:
         rgb = np.empty((height * width, 3), dtype=np.float32)
         alpha = np.empty(height * width, dtype=np.float32)
         weight = np.empty(height * width, dtype=np.float32)
-        for pixels, view, y, x in _iterate_row_blocks(view_index, width, height):
+        for pixels, view, y, x in iterate_row_blocks(view_index, width, height):
             rgb[pixels], alpha[pixels], weight[pixels] = self.pixels(view, y, x)
         return rgb.reshape(height, width, 3), alpha.reshape(height, width), weight.reshape(height, width)
 
@@ -374,30 +385,11 @@ class Dataset:
         """Release mapped pages to the system, e.g. before a stage that needs the memory."""
         for mapped in (self._cache.rgb, self._cache.alpha, self._cache.mask):
             mapped.release()
-        if self._depth_maps is not None:
-            self._depth_maps.values.release()
+        if self.depth_maps is not None:
+            self.depth_maps.values.release()
         self._view_rays.release_pages()
 
     def _view_size(self, view_index: int) -> tuple[int, int]:
         if not 0 <= view_index < len(self.views):
             raise IndexError(f"there is no view {view_index} among {len(self.views)}")
         return self.views[view_index].width_px, self.views[view_index].height_px
-
-
-def _require_masks(model: DatasetModel, root: Path, masks: MaskUse) -> None:
-    if masks == "alpha" and all(view.mask_path is None for view in model.views):
-        raise DatasetError(
-            f"Masks are to be the alpha, but {root / 'masks'} holds none of any photograph; put them "
-            f"there (as {model.views[0].name}.png) or leave --masks alpha out."
-        )
-
-
-def _iterate_row_blocks(
-    view_index: int, width: int, height: int
-) -> Iterator[tuple[slice, Int64[np.ndarray, " n"], Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]]]:
-    """Yield all pixels of a view, some rows at a time: their index in the view, view, y and x."""
-    step = rows_per_block(width)
-    for start in range(0, height, step):
-        stop = min(start + step, height)
-        y, x = np.divmod(np.arange(start * width, stop * width, dtype=np.int64), width)
-        yield slice(start * width, stop * width), np.full(len(y), view_index, dtype=np.int64), y, x

@@ -40,6 +40,7 @@ def load_dataset_model(
     min_views: int = MIN_PHOTOGRAPHS,
     for_training: bool = True,
     origin_world: Origin | None = None,
+    infos: Mapping[Path, ImageInfo] | None = None,
 ) -> DatasetModel:
     """Read the model of a scene and the headers of its photographs, but no pixels.
 
@@ -54,6 +55,7 @@ def load_dataset_model(
         for_training: warn of what matters to training only.
         origin_world: local origin to take, that of the scene whose photographs these are; None chooses one
             where coordinates are large, see :mod:`octasplat.engine.core.local_origin`.
+        infos: headers that are known, by the files, which are then not read.
 
     Raises:
         DatasetError: something is missing, damaged or does not fit together.
@@ -83,7 +85,20 @@ def load_dataset_model(
     if model_folder is None:
         _warn_of_other_models(root, found.folder, warnings)
 
-    return _model_of_views(root, found, located, masks, depths, max_side, warnings)
+    return _model_of_views(root, found, located, masks, depths, max_side, warnings, infos or {})
+
+
+def require_masks(model: DatasetModel) -> None:
+    """Refuse a scene without masks, where these are to be the alpha.
+
+    Raises:
+        DatasetError: no photograph has one.
+    """
+    if all(view.mask_path is None for view in model.views):
+        raise DatasetError(
+            f"Masks are to be the alpha, but {model.root / 'masks'} holds none of any photograph; put them "
+            f"there (as {model.views[0].name}.png) or leave --masks alpha out."
+        )
 
 
 def _check_root(root: Path, *, has_found_model: bool) -> None:
@@ -265,6 +280,7 @@ def _model_of_views(
     depths: Sequence[Path | None],
     max_side: int | None,
     warnings: list[str],
+    infos_known: Mapping[Path, ImageInfo],
 ) -> DatasetModel:
     """Return the model of the photographs that were found, of the sizes that ``max_side`` caps."""
     images = located.images
@@ -273,7 +289,7 @@ def _model_of_views(
     observed_px: list[Float64[np.ndarray, "k 2"]] = []
     camera_indices: dict[Camera, int] = {}
     for image, path, mask, depth in zip(images, located.paths, masks, depths, strict=True):
-        info = read_image_info(path)
+        info = infos_known.get(path) or read_image_info(path)
         original = found.cameras[image.camera_id]
         _check_size(original, info, image, path)
         width, height = capped_size(info.width_px, info.height_px, max_side)

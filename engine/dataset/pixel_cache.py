@@ -10,7 +10,7 @@ folder, sizes and times, which spares reading them again.
 import hashlib
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ from octasplat.engine.dataset.model import DatasetModel, DatasetView
 from octasplat.engine.dataset.value_scale import find_value_scales
 from octasplat.engine.dataset.views_file import FileDigests
 
-CACHE_VERSION = 3
+CACHE_VERSION = 4
 """Raised whenever the contents of the cache files change for the same photographs."""
 
 DECODING_BYTES = 2 << 30
@@ -50,6 +50,8 @@ class PixelCache:
         offsets: first pixel of every view, and the count of all pixels at the end.
         digests: of the files of every view.
         warnings: one sentence each on what is odd but usable.
+        scales: of the values of storages that are not as their formats say.
+        is_partial: whether some views have no pixels here.
     """
 
     rgb: MappedArray
@@ -58,6 +60,37 @@ class PixelCache:
     offsets: Int64[np.ndarray, " views_and_end"]
     digests: tuple[FileDigests, ...]
     warnings: tuple[str, ...]
+    scales: Mapping[Storage, ValueScale]
+    is_partial: bool = False
+
+    def require(self, view: Int64[np.ndarray, " n"]) -> None:
+        """Refuse pixels of views that a partial cache does not hold.
+
+        Raises:
+            IndexError: there is one.
+        """
+        if self.is_partial:
+            inside = view[(view >= 0) & (view < len(self.digests))]
+            lacking = inside[np.diff(self.offsets)[inside] == 0]
+            if len(lacking):
+                raise IndexError(f"the photograph of view {lacking[0]} is not among those that were opened")
+
+
+@dataclass(frozen=True)
+class CacheForm:
+    """What all photographs of a scene decide together, where only some of them are decoded.
+
+    Attributes:
+        bits: 8 or 16, of the deepest of them.
+        has_alpha: whether any of them is transparent anywhere.
+        has_masks: whether any of them has a mask.
+        scales: of the values of storages that are not as their formats say.
+    """
+
+    bits: int
+    has_alpha: bool
+    has_masks: bool
+    scales: Mapping[Storage, ValueScale]
 
 
 def file_digests(model: DatasetModel, folder: Path, *, threads: int = 0) -> tuple[FileDigests, ...]:
@@ -80,6 +113,7 @@ def open_pixel_cache(
     *,
     threads: int = 0,
     progress: Progress | None = None,
+    form: CacheForm | None = None,
 ) -> PixelCache:
     """Map the pixels of ``model``, decoding them into ``folder`` first unless they are there already.
 
@@ -90,6 +124,7 @@ def open_pixel_cache(
             then not decoded again.
         threads: decoding threads; 0 takes one per processor. Fewer run where photographs are huge.
         progress: called with (photographs done, total) while decoding.
+        form: of the cache of all photographs, where ``model`` has only some of their views.
 
     Raises:
         DatasetError: a photograph or a mask cannot be read.
@@ -108,9 +143,7 @@ def open_pixel_cache(
         else:
             index = None
     if index is None:
-        _build_cache(
-            model=model, folder=folder, offsets=offsets, stamp=stamp, threads=threads, progress=progress
-        )
+        _build_cache(model, folder, offsets, stamp, threads=threads, progress=progress, form=form)
         index = _read_index(folder, int(offsets[-1]))
         if index is None or index["stamp"] != stamp:
             raise OutputError(
@@ -124,6 +157,7 @@ def open_pixel_cache(
         offsets=offsets,
         digests=tuple(FileDigests(*pair) for pair in index["digests"]),
         warnings=tuple(index["warnings"]),
+        scales={name: ValueScale(*scale) for name, scale in index["scales"].items()},
     )
 
 
@@ -136,6 +170,7 @@ class _Index(TypedDict):
     alpha: bool
     mask: bool
     warnings: list[str]
+    scales: dict[Storage, tuple[float, bool]]
 
 
 def _open_plane(path: Path, exists: bool) -> MappedArray:
@@ -193,13 +228,14 @@ def _build_cache(
     stamp: str,
     threads: int,
     progress: Progress | None,
+    form: CacheForm | None,
 ) -> None:
-    bits = max(info.bits for info in model.image_infos)
-    pixels = int(offsets[-1])
+    infos, pixels = model.image_infos, int(offsets[-1])
+    bits = max(info.bits for info in infos) if form is None else form.bits
     planes = {"rgb": 3 * pixels * bits // 8}
-    if any(info.has_alpha for info in model.image_infos):
+    if any(info.has_alpha for info in infos) if form is None else form.has_alpha:
         planes["alpha"] = pixels
-    if any(view.mask_path is not None for view in model.views):
+    if any(view.mask_path is not None for view in model.views) if form is None else form.has_masks:
         planes["mask"] = pixels
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -213,11 +249,12 @@ def _build_cache(
                 files[name] = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
                 stack.callback(os.close, files[name])
                 os.posix_fallocate(files[name], 0, size)  # a full disk shows now, not after an hour
-            summaries, warnings = _decode_all(
-                model=model, offsets=offsets, bits=bits, files=files, threads=threads, progress=progress
-            )
+            summaries, scales, warnings = _decode_all(
+                model=model, offsets=offsets, bits=bits, files=files, threads=threads, progress=progress,
+                scales=None if form is None else form.scales,
+            )  # fmt: skip
         # Many RGBA files are opaque throughout; their plane would only cost memory traffic.
-        transparent = any(summary.is_transparent for summary in summaries)
+        transparent = any(each.is_transparent for each in summaries) if form is None else form.has_alpha
         for name in ("alpha", "mask"):
             if name not in planes or (name == "alpha" and not transparent):
                 (folder / f"{name}.bin").unlink(missing_ok=True)
@@ -227,8 +264,9 @@ def _build_cache(
         raise OutputError(
             f"The pixel cache cannot be written to {folder} ({error.strerror}); name another folder."
         ) from error
-    masks = [summary.mask for summary in summaries if summary.mask is not None]
-    warnings += check_masks(masks, len(model.views))
+    if form is None:  # else all of them were judged together
+        masks = [summary.mask for summary in summaries if summary.mask is not None]
+        warnings += check_masks(masks, len(model.views))
     index: _Index = {
         "version": CACHE_VERSION,
         "stamp": stamp,
@@ -238,6 +276,7 @@ def _build_cache(
         "alpha": "alpha" in planes and transparent,
         "mask": "mask" in planes,
         "warnings": warnings,
+        "scales": {name: (scale.full, scale.is_display) for name, scale in scales.items()},
     }
     # Last of all, as only the index makes the files valid
     write_json(folder / "pixels.json", index)
@@ -257,10 +296,12 @@ def _decode_all(
     files: dict[str, int],
     threads: int,
     progress: Progress | None,
-) -> tuple[list[_ViewSummary], list[str]]:
-    """Decode all views into ``files``; return what was found, and warnings."""
-    # Found below, before any call of decode()
-    scales: dict[Storage, ValueScale] = {}
+    scales: Mapping[Storage, ValueScale] | None,
+) -> tuple[list[_ViewSummary], Mapping[Storage, ValueScale], list[str]]:
+    """Decode all views into ``files``; return what was found, the scales of values, and warnings."""
+    # Found below where they are not given, before any call of decode()
+    known: Mapping[Storage, ValueScale] = scales or {}
+    warnings: tuple[str, ...] = ()
 
     def decode(index: int) -> _ViewSummary:
         view, info = model.views[index], model.image_infos[index]
@@ -270,7 +311,7 @@ def _decode_all(
             offset=int(offsets[index]),
             bits=bits,
             files=files,
-            scale=scales.get(info.storage),
+            scale=known.get(info.storage),
         )
 
     # Bytes per pixel: as stored, as float32, and a copy of either while channels are rearranged.
@@ -281,7 +322,8 @@ def _decode_all(
         photographs = [
             (view.image_path, info) for view, info in zip(model.views, model.image_infos, strict=True)
         ]
-        scales, warnings = find_value_scales(photographs, pool.map)
+        if scales is None:
+            known, warnings = find_value_scales(photographs, pool.map)
         futures = [pool.submit(decode, index) for index in range(len(model.views))]
         try:
             for future in futures:
@@ -291,7 +333,7 @@ def _decode_all(
         finally:
             # After an error the other photographs need not be decoded.
             pool.shutdown(cancel_futures=True)
-    return summaries, list(warnings)
+    return summaries, known, list(warnings)
 
 
 def _decode_view(

@@ -6,7 +6,7 @@ every pixel (row by row, 3 float32, camera coordinates; not-a-number where the m
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -124,3 +124,14 @@ def _is_up_to_date(table: Path, index_file: Path, index_text: str, size: int) ->
         return index_file.read_text(encoding="utf-8") == index_text and table.stat().st_size == size
     except (OSError, ValueError):
         return False
+
+
+def iterate_row_blocks(
+    view_index: int, width: int, height: int
+) -> Iterator[tuple[slice, Int64[np.ndarray, " n"], Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]]]:
+    """Yield all pixels of a view, some rows at a time: their index in the view, view, y and x."""
+    step = rows_per_block(width)
+    for start in range(0, height, step):
+        stop = min(start + step, height)
+        y, x = np.divmod(np.arange(start * width, stop * width, dtype=np.int64), width)
+        yield slice(start * width, stop * width), np.full(len(y), view_index, dtype=np.int64), y, x

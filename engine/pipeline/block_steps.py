@@ -4,7 +4,14 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from octasplat.engine.blocks.block_merge import BlockScene
+from octasplat.engine.blocks.block_photographs import (
+    BlockPhotographs,
+    read_block_photographs,
+    write_block_photographs,
+)
 from octasplat.engine.blocks.block_scene import plan_scene, train_block, train_in_blocks
 from octasplat.engine.blocks.piece_progress import PieceProgress
 from octasplat.engine.blocks.piece_training import RESULT, BlockWork
@@ -12,6 +19,7 @@ from octasplat.engine.blocks.scene_plan import COARSE, ScenePlan, block_name, ha
 from octasplat.engine.core.events import PhaseStarted, Warned, ignore_events
 from octasplat.engine.core.progress import phase
 from octasplat.engine.dataset import Dataset
+from octasplat.engine.dataset.dataset_part import photograph_facts
 from octasplat.engine.pipeline.run import ReconstructionRun
 from octasplat.engine.runs.run_folder import BLOCKS, CACHE, SCENE, found_model_folder, open_run_dataset
 from octasplat.engine.train.views.exposure_changes import resolve_exposure
@@ -39,7 +47,13 @@ class PlanBlocks:
         assert run.blocks is not None
         work = _block_work(run)
         tell = PieceProgress(run.progress)
-        plan_scene(work, count, _CoarseDataset(run), tell, most_gaussians=run.blocks.most_gaussians)
+        most = run.blocks.most_gaussians
+        plan = plan_scene(work, count, _CoarseDataset(run), tell, most_gaussians=most)
+        views = (np.unique(block.pixels.view).tolist() for block in plan.blocks)
+        record = BlockPhotographs(
+            facts=photograph_facts(run.dataset), exposure=bool(work.config.exposure), views=tuple(views)
+        )
+        write_block_photographs(record, work.folder)
         shutil.rmtree(_coarse_cache(run), ignore_errors=True)
 
 
@@ -65,11 +79,12 @@ class TrainBlock:
             CheckpointError: the plan or the coarse scene is missing or damaged.
         """
         plan = load_plan(run.output / BLOCKS)
+        known = read_block_photographs(run.output / BLOCKS)
         iterations = plan.iterations[self.number - 1]
         with phase("train", run.progress, iterations):
             tell = PieceProgress(run.progress)
             tell.expect({block_name(self.number): iterations})
-            train_block(_block_work(run), plan, self.number, tell)
+            train_block(_block_work(run, known), plan, self.number, tell)
 
 
 def count_blocks(run: ReconstructionRun) -> int:
@@ -129,9 +144,11 @@ def _coarse_cache(run: ReconstructionRun) -> Path:
     return run.output / BLOCKS / COARSE / CACHE
 
 
-def _block_work(run: ReconstructionRun) -> BlockWork:
+def _block_work(run: ReconstructionRun, known: BlockPhotographs | None = None) -> BlockWork:
+    """Return what the trainings share; ``known`` is what was decided by all photographs, if that is known."""
     dataset, config = run.dataset, run.train_config
-    exposure, exposure_changes = resolve_exposure(config.exposure, dataset, has_materials=False)
+    decided = config.exposure if known is None else known.exposure
+    exposure, exposure_changes = resolve_exposure(decided, dataset, has_materials=False)
     if exposure_changes is not None and not has_plan(run.output / BLOCKS):  # else it was told
         run.progress(Warned(f"{exposure_changes} That is learnt; exposure=false leaves it out."))
     return BlockWork(

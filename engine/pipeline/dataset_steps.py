@@ -1,5 +1,8 @@
 """Steps before the training: pose search, and opening of the dataset."""
 
+from dataclasses import dataclass
+
+from octasplat.engine.blocks.block_photographs import read_block_photographs
 from octasplat.engine.core.events import Noted, Warned
 from octasplat.engine.core.georeference import GEOREFERENCE_FILE, write_georeference
 from octasplat.engine.core.progress import phase
@@ -8,17 +11,19 @@ from octasplat.engine.dataset.views_file import write_views
 from octasplat.engine.georeference.find_georeference import find_georeference
 from octasplat.engine.georeference.request import read_request
 from octasplat.engine.pipeline.output_folder import write_config
-from octasplat.engine.pipeline.run import ReconstructionRun
+from octasplat.engine.pipeline.run import ReconstructionRun, run_steps
 from octasplat.engine.pipeline.start_scene import check_start, has_start
 from octasplat.engine.poses.photographs import notes_on_files
 from octasplat.engine.runs.config import read_config
 from octasplat.engine.runs.run_folder import (
+    BLOCKS,
     CONFIG,
     HELD_OUT,
     VIEWS,
     dataset_folder_of_run,
     found_model_folder,
     open_run_dataset,
+    open_run_part,
 )
 from octasplat.engine.runs.run_poses import estimate_principal_points, find_missing_poses, repair_run_poses
 from octasplat.engine.train.sampling.batches import BatchOptions, BatchSource
@@ -73,9 +78,49 @@ class OpenDataset:
             write_views(output / VIEWS, run.dataset.views_record)
         held_out = [run.dataset.views[i].name for i in run.dataset.test_indices]
         write_held_out(output / HELD_OUT, held_out)
-        if dataset_folder_of_run(output) != run.scene.resolve() or read_config(output / CONFIG) != run.config:
-            # The photographs have moved, or other files are wanted.
-            write_config(run.scene, output, run.config)
+        _note_folder(run)
+
+
+@dataclass(frozen=True)
+class OpenBlockPhotographs:
+    """Open the photographs that one block of a planned run needs; all of them where that is not known.
+
+    Attributes:
+        number: of the block, from 1.
+    """
+
+    number: int
+    is_needed_later = True
+
+    def is_done(self, run: ReconstructionRun) -> bool:
+        """Return False: each run opens its photographs, from a cache if it has one."""
+        return False
+
+    def __call__(self, run: ReconstructionRun) -> None:
+        """Open the photographs."""
+        known = read_block_photographs(run.output / BLOCKS)
+        if known is None or run.recorded is None or self.number > len(known.views):  # a plan of old
+            run_steps((FindPoses(), OpenDataset()), run)
+            return
+        with phase("load", run.progress):
+            run.dataset = open_run_part(
+                run.scene,
+                run.output,
+                run.config,
+                run.threads,
+                run.progress,
+                known.views[self.number - 1],
+                known.facts,
+                check_views=run.check_views,
+            )
+        _note_folder(run)
+
+
+def _note_folder(run: ReconstructionRun) -> None:
+    """Write where the photographs are, if they have moved, and which files are wanted, if others are."""
+    output = run.output
+    if dataset_folder_of_run(output) != run.scene.resolve() or read_config(output / CONFIG) != run.config:
+        write_config(run.scene, output, run.config)
 
 
 def _repair_poses(run: ReconstructionRun) -> None:

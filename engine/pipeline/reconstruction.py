@@ -11,7 +11,8 @@ from octasplat.engine.core.threads import use_threads
 from octasplat.engine.dataset.views_file import ViewsRecord, read_views
 from octasplat.engine.files import check_writable
 from octasplat.engine.pipeline.block_request import BlockRequest, keep_request
-from octasplat.engine.pipeline.dataset_steps import FindPoses, OpenDataset
+from octasplat.engine.pipeline.block_steps import TrainBlock
+from octasplat.engine.pipeline.dataset_steps import FindPoses, OpenBlockPhotographs, OpenDataset
 from octasplat.engine.pipeline.output_folder import claim_output, release_on_refusal
 from octasplat.engine.pipeline.result_steps import EvaluateStep, ExportStep
 from octasplat.engine.pipeline.run import OnStep, ReconstructionRun, Step, run_steps
@@ -118,13 +119,19 @@ def _run_all_steps(run: ReconstructionRun, steps: Sequence[Step], *, is_new: boo
         run.check_views = _require_same_dataset(recorded, run.scene, output, events)
     try:
         with release_on_refusal(output, is_new=is_new, is_made=is_made):
-            run_steps(DATASET_STEPS, run)
+            run_steps(_steps_before(steps), run)
         run_steps(steps, run)
         run.dataset.release_pages()
         if steps is RESULT_STEPS:
             report(RunFinished(_result_names(output), time.perf_counter() - began))
     finally:
         events.close()
+
+
+def _steps_before(steps: Sequence[Step]) -> Sequence[Step]:
+    """Return the steps that open the photographs which the others need."""
+    blocks = [step for step in steps if isinstance(step, TrainBlock)]
+    return (OpenBlockPhotographs(blocks[0].number),) if blocks else DATASET_STEPS
 
 
 def _result_names(output: Path) -> tuple[str, ...]:

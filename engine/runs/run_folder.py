@@ -1,7 +1,7 @@
 """Run folder: the names of its files, and the photographs and cameras of the run."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -13,6 +13,8 @@ from octasplat.engine.core.events import EventListener, PhaseProgress, Warned
 from octasplat.engine.core.local_origin import Origin
 from octasplat.engine.dataset import Dataset, load_dataset_model
 from octasplat.engine.dataset.camera_clearance import CameraClearance
+from octasplat.engine.dataset.dataset_part import open_dataset_part
+from octasplat.engine.dataset.photograph_facts import PhotographFacts
 from octasplat.engine.dataset.region import Region
 from octasplat.engine.dataset.scene_split import SplitRule
 from octasplat.engine.dataset.view_frusta import ViewFrusta
@@ -264,8 +266,60 @@ def open_run_dataset(
         threads=threads,
         progress=lambda done, total: progress(PhaseProgress("load", done, total)),
     )
+    _tell_what_is_odd(dataset, config, progress)
+    return dataset
+
+
+def open_run_part(
+    scene: Path,
+    output: Path,
+    config: ReconstructionConfig,
+    threads: int,
+    progress: EventListener,
+    views: Sequence[int],
+    facts: PhotographFacts,
+    *,
+    check_views: Callable[[ViewsRecord], None] | None = None,
+) -> Dataset:
+    """Open some of the photographs of a run that goes on; the others need not be there.
+
+    Args:
+        scene: folder of the photographs, in which files of the others may be empty.
+        output: folder of the run, which holds its views and the cache.
+        config: of the run.
+        threads: for decoding; 0 takes all cores.
+        progress: receives the progress events, and what is odd but usable.
+        views: indices of those to open, ascending.
+        facts: on all photographs.
+        check_views: see :func:`open_run_dataset`.
+
+    Raises:
+        DatasetError: the photographs cannot be used.
+        CheckpointError: the scene has other photographs than the facts are on.
+        OutputError: the cache cannot be written.
+    """
+    dataset = open_dataset_part(
+        scene,
+        output / CACHE,
+        np.array(views, np.int64),
+        facts,
+        read_views(output / VIEWS),
+        max_side=config.max_side,
+        masks=config.masks,
+        model_folder=found_model_folder(output),
+        model=config.model,
+        near=config.train.near,
+        geometry=find_known_geometry(scene),
+        check_views=check_views,
+        threads=threads,
+        progress=lambda done, total: progress(PhaseProgress("load", done, total)),
+    )
+    _tell_what_is_odd(dataset, config, progress)
+    return dataset
+
+
+def _tell_what_is_odd(dataset: Dataset, config: ReconstructionConfig, progress: EventListener) -> None:
     for warning in dataset.warnings:
         progress(Warned(warning))
     if (mismatch := config.background_mismatch(dataset.has_alpha)) is not None:
         progress(Warned(mismatch))
-    return dataset

@@ -13,7 +13,7 @@ from tests.support.worker_harness import WorkerHarness
 def store_dataset(bench: WorkerHarness, scene: Path) -> uuid.UUID:
     """Put the photographs into the store and the tables."""
     (bench.folder / "store").mkdir(exist_ok=True)
-    storage = open_storage(bench.folder / "store")
+    storage = open_storage(bench.store)
 
     async def store(connection: Connection) -> uuid.UUID:
         await lock_owner(connection, "me")

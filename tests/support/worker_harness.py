@@ -46,12 +46,17 @@ class WorkerHarness:
         folder: for the store, the work and the logs.
         stale_seconds: after how long others take the jobs of a worker that is not heard of; soon where that
             is what is tested, as a busy machine may keep any worker from saying anything for a while.
+        store: its address; empty for one in the folder.
     """
 
     conninfo: str
     folder: Path
     stale_seconds: float = 60.0
     processes: list["subprocess.Popen[bytes]"] = field(default_factory=list)
+    store: str = ""
+
+    def __post_init__(self) -> None:
+        self.store = self.store or str(self.folder / "store")
 
     @property
     def gate(self) -> Path:
@@ -66,7 +71,7 @@ class WorkerHarness:
             **FAST,
             **({} if release is None else {"KIND_MODULES": '["toy_kind"]'}),
             "STALE_SECONDS": str(self.stale_seconds),
-            "STORAGE": str(self.folder / "store"),
+            "STORAGE": self.store,
             "WORK": str(self.folder / f"work-{name}"),
         }
         given.update(settings)
@@ -139,7 +144,7 @@ class WorkerHarness:
 
     def results(self, job_id: uuid.UUID) -> dict[str, bytes]:
         """Contents of the job's results by name."""
-        storage = open_storage(self.folder / "store")
+        storage = open_storage(self.store)
         artifacts: list[Artifact] = self.run_query(lambda c: artifacts_of(c, job_id))
         return {a.name: b"".join(storage.read(a.sha256)) for a in artifacts}
 
@@ -210,6 +215,17 @@ def child_pids(worker: "subprocess.Popen[bytes]") -> list[int]:
     """Processes that a worker has started."""
     found = Path(f"/proc/{worker.pid}/task/{worker.pid}/children").read_text().split()
     return [int(pid) for pid in found]
+
+
+def kill_tree(worker: "subprocess.Popen[bytes]") -> None:
+    """Kill a worker and all that it has started, and what these have, at once."""
+    pids = [worker.pid]
+    for pid in pids:
+        with contextlib.suppress(FileNotFoundError):
+            pids += map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split())
+    for pid in pids:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
 
 
 def is_alive(pid: int) -> bool:

@@ -5,23 +5,25 @@ import uuid
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from octasplat.engine.core.events import CheckpointWritten, Event
 from octasplat.engine.pipeline import BlockRequest, reconstruct
-from octasplat.workers.db.rows import Job
+from octasplat.workers.db.rows import DatasetFile, Job
 from octasplat.workers.storage.local import LocalStorage
 from octasplat.workers.storage.trees import TreeFile
 from octasplat.workers.worker.checkpoint import Checkpoint, plan_digest
+from octasplat.workers.worker.job_inputs import JobInputs, fetch_photographs
 from octasplat.workers.worker.job_kinds import get_job_kind
 from octasplat.workers.worker.job_kinds.reconstruct_kinds import ReconstructJobConfig
 from octasplat.workers.worker.reconstruct_handler import reconstruct as run_whole
 from octasplat.workers.worker.reconstruct_handler import train_block
 from octasplat.workers.worker.task import BlocksPlanned, Task
 from octasplat.workers.worker.workspace import Workspace
-from tests.support.tiny_dataset import make_tiny_dataset
+from tests.support.wall_dataset import make_wall_dataset
 
 pytestmark = pytest.mark.heavy
 
@@ -29,7 +31,7 @@ REQUESTED = {
     "train": {
         **{"iterations": 30, "rays_per_batch": 512, "sh_degree": 1, "max_gaussians": 600},
         **{"initial_points": 300, "probe_rays": 256, "checkpoint_every": 10},
-        **{"background": "learnt", "exposure": True},
+        **{"background": "learnt", "exposure": "auto"},
     },
     "test_every": 4,
     "exports": ["mesh.ply"],
@@ -39,7 +41,7 @@ NOW = datetime.now(UTC)
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_tiny_dataset(tmp_path_factory, views=10, width_px=64, height_px=48)
+    return make_wall_dataset(tmp_path_factory.mktemp("wall"), with_masks=True, with_depths=True)
 
 
 def make_job(options: dict[str, Any], role: str, attempt: int = 1) -> Job:
@@ -47,6 +49,27 @@ def make_job(options: dict[str, Any], role: str, attempt: int = 1) -> Job:
     nothing = dict.fromkeys(Job.__dataclass_fields__)
     given = {"id": uuid.uuid4(), "kind": "reconstruct", "options": options, "role": role, "attempt": attempt}
     return Job(**{**nothing, **given, "fresh_after": 0, "created_at": NOW})  # type: ignore[arg-type]
+
+
+def store_photographs(scene: Path, storage: LocalStorage) -> JobInputs:
+    """Photographs in the store, and their rows."""
+    rows = []
+    for path in sorted(path for path in scene.rglob("*") if path.is_file()):
+        with storage.open_writer() as writer:
+            writer.write(path.read_bytes())
+            blob = writer.commit()
+        rows.append(
+            DatasetFile(
+                uuid.uuid4(), path.relative_to(scene).as_posix(), blob.sha256, blob.size_bytes, {}, NOW
+            )
+        )
+    dataset: Any = SimpleNamespace(id=uuid.uuid4(), name="wall")
+    return JobInputs(dataset, rows, [], [], [], [])
+
+
+def views_there(place: Path, folder: str) -> set[int]:
+    """Numbers of the files that are not empty."""
+    return {int(path.name[:3]) for path in (place / folder).iterdir() if path.stat().st_size}
 
 
 def run_task(
@@ -62,17 +85,17 @@ def test_programs_hand_over_what_makes_the_bytes_of_one_process(scene: Path, tmp
     complete = kind.resolve({**REQUESTED, "blocks": 2})
     assert isinstance(complete, ReconstructJobConfig)
     options = complete.model_dump(mode="json")
-    photographs = tmp_path / "datasets" / "id" / "tiny"
-    photographs.parent.mkdir(parents=True)
-    photographs.symlink_to(scene)
     whole = reconstruct(
         scene, tmp_path / "whole", complete.run_config(), threads=1, blocks=BlockRequest(count=2)
     )
     storage = LocalStorage(tmp_path / "store", floor_bytes=0)
+    inputs = store_photographs(scene, storage)
 
     root = make_job(options, "root")
     first = Workspace(tmp_path / "work", root, storage)
     first.open()
+    photographs = fetch_photographs(first, kind, complete, inputs)
+    assert views_there(photographs, "images") == set(range(16))
     events, _ = run_task(run_whole, first, options, photographs)
     (planned,) = [event for event in events if isinstance(event, BlocksPlanned)]
     assert planned.numbers == (1, 2) and planned.first_iterations == 15
@@ -81,19 +104,26 @@ def test_programs_hand_over_what_makes_the_bytes_of_one_process(scene: Path, tmp
     checkpoint = first.store_checkpoint("train", 15)
     assert checkpoint is not None
     names = {file.path.removeprefix("run/") for file in checkpoint.files}
-    pieces = {"request.json", "plan.npz", "coarse/best.npz", "coarse/piece.json"}
+    pieces = {"request.json", "plan.npz", "photographs.json", "coarse/best.npz", "coarse/piece.json"}
     assert {name for name in names if name.startswith("blocks/")} == {f"blocks/{name}" for name in pieces}
     assert {"config.json", "views.json", "held_out.json", "events.jsonl"} < names
     digest = plan_digest(checkpoint)
     assert len(digest) == 129
 
     made: list[TreeFile] = []
+    # Those that show the wall from its beginning to the middle, or from there to its end, and none held out.
+    shown = {1: {1, 2, 3, 5, 6, 7, 9, 10}, 2: {6, 7, 9, 10, 11, 13, 14, 15}}
     for number in (2, 1):
         given = kind.options_of_block(complete, number, 30, digest)
-        assert get_job_kind(kind.block_kind).options.model_validate(given).number == number
+        block_kind = get_job_kind(kind.block_kind)
+        block_options = block_kind.options.model_validate(given)
+        assert block_options.number == number
         block = Workspace(tmp_path / f"other-{number}", make_job(given, "block"), storage)
         block.open()
         block.fetch_from_others(checkpoint.files)
+        photographs = fetch_photographs(block, block_kind, block_options, inputs)
+        assert views_there(photographs, "images") == views_there(photographs, "depths") == shown[number]
+        assert views_there(photographs, "masks") == {view for view in shown[number] if view % 2}
         events, _ = run_task(train_block, block, given, photographs)
         assert 25 in [event.iteration for event in events if isinstance(event, CheckpointWritten)]
         own = block.store_checkpoint("train", 30)
@@ -109,6 +139,7 @@ def test_programs_hand_over_what_makes_the_bytes_of_one_process(scene: Path, tmp
     last.open()
     last.restore(Checkpoint.from_row(checkpoint.as_row()))
     last.fetch_from_others(made)
+    photographs = fetch_photographs(last, kind, complete, inputs)
     events, _ = run_task(run_whole, last, options, photographs)
     assert not any(isinstance(event, BlocksPlanned) for event in events)
     steps = [event.iteration for event in events if isinstance(event, CheckpointWritten)]
@@ -117,6 +148,7 @@ def test_programs_hand_over_what_makes_the_bytes_of_one_process(scene: Path, tmp
         assert (last.folder / "results" / name).read_bytes() == (whole / name).read_bytes(), name
     record = json.loads((last.folder / "results" / "training.json").read_text())
     assert list(record["pieces"]) == ["coarse", "block_001", "block_002", "finish"]
+    assert record["exposures"]  # which all photographs together asked for
     assert not (last.folder / "results" / "blocks").exists()
     kept = last.store_checkpoint("export", 1)
     assert kept is not None and not any(file.path.endswith(".npz") for file in kept.files)

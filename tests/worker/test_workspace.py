@@ -5,12 +5,15 @@ import os
 import shutil
 import time
 import uuid
+from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from octasplat.workers.db.rows import DatasetFile
 from octasplat.workers.storage.errors import StorageFullError, StorageUnavailableError
 from octasplat.workers.storage.local import LocalStorage
 from octasplat.workers.storage.trees import TreeFile
@@ -50,6 +53,44 @@ def test_photographs_on_failing_disk_raise_errors_of_storage(
     (tmp_path / "work" / "datasets").touch()
     with pytest.raises(StorageUnavailableError):
         workspace.fetch_dataset(dataset, [], "d")
+
+
+def test_photographs_are_fetched_once_a_host_and_only_those_needed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    storage = LocalStorage(tmp_path / "store", floor_bytes=0)
+    files, now = [], datetime.now(UTC)
+    dataset = uuid.uuid4()
+    for number in range(5):
+        with storage.open_writer() as writer:
+            writer.write(bytes([number]) * 10)
+            blob = writer.commit()
+        files.append(DatasetFile(dataset, f"images/{number}.png", blob.sha256, blob.size_bytes, {}, now))
+    fetched: list[str] = []
+    original = LocalStorage.materialise
+
+    def record(self: LocalStorage, sha256: str, target: Path, *, writable: bool = False) -> None:
+        fetched.append(sha256)
+        original(self, sha256, target, writable=writable)
+
+    monkeypatch.setattr(LocalStorage, "materialise", record)
+
+    def fill(*numbers: int) -> dict[int, bytes]:
+        workspace = make_workspace(tmp_path)
+        needed = {f"images/{number}.png" for number in numbers} if numbers else None
+        place = workspace.fetch_dataset(dataset, files, "d", needed)
+        workspace.close()
+        there = {int(path.stem): path.read_bytes() for path in place.glob("images/*")}
+        assert sorted(there) == [0, 1, 2, 3, 4]
+        return {number: content for number, content in there.items() if content}
+
+    assert sorted(fill(0, 1)) == [0, 1]
+    with ThreadPoolExecutor(2) as pool:  # two at a time, which need the same
+        list(pool.map(lambda last: fill(1, 2, last), (2, 3)))
+    assert fill() == {number: bytes([number]) * 10 for number in range(5)}
+    assert sorted(fetched) == sorted(file.sha256 for file in files)
+    left = tmp_path / "work" / "datasets" / str(dataset)
+    assert {path.name for path in left.iterdir()} == {"d", LOCK_FILE}
 
 
 def test_stored_frames_on_failing_disk_raise_errors_of_storage(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 from pydantic import BaseModel
 
@@ -13,6 +15,8 @@ from octasplat.workers.queue.jobs import artifacts_of, get_job
 from octasplat.workers.storage.trees import TreeFile
 from octasplat.workers.worker.job_kinds import JobKind
 from octasplat.workers.worker.start_files import start_choices
+from octasplat.workers.worker.task import RUN_FOLDER
+from octasplat.workers.worker.workspace import Workspace
 
 
 @dataclass(frozen=True)
@@ -56,3 +60,21 @@ async def read_inputs(connection: Connection, job: Job, kind: JobKind, options: 
         others=await files_from_others(connection, job) if job.role is not None else [],
         named=await files_of(connection, job.files_id) if job.files_id else [],
     )
+
+
+def fetch_photographs(
+    workspace: Workspace, kind: JobKind[Any], options: BaseModel, inputs: JobInputs
+) -> Path:
+    """Fetch the photographs that a job needs, after all else that goes into its folder; blocks.
+
+    Returns:
+        The folder of the photographs, in which others may be empty.
+
+    Raises:
+        StorageError: a photograph is gone or damaged, or the folder cannot be written.
+        CheckpointError: what tells which are needed is damaged.
+    """
+    dataset, files = inputs.dataset, inputs.photographs
+    assert dataset is not None
+    needed = kind.needed_files(options, workspace.folder / RUN_FOLDER, [file.path for file in files])
+    return workspace.fetch_dataset(dataset.id, files, dataset.name, needed)

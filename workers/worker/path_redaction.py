@@ -45,7 +45,7 @@ class PathRedactor:
         names.append((_OTHER_ATTEMPT, ""))
         for root in _path_patterns(work):
             names += [
-                # The folders are those of Workspace.fetch_dataset: datasets, an id, and the dataset's name.
+                # The folders are those of DatasetFolder: datasets, an id, and the dataset's name.
                 (rf"{root}/datasets/[^/\s]+/[^/\s]+/", ""),
                 (rf"{root}/datasets/[^/\s]+/[^/\s\"']+", "the scene"),
                 (rf"{root}\b", "the work folder"),

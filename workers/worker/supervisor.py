@@ -30,7 +30,7 @@ from octasplat.workers.worker.checkpoint import Checkpoint
 from octasplat.workers.worker.child_process import ChildProcess
 from octasplat.workers.worker.context import DatabaseLostError, WorkerContext
 from octasplat.workers.worker.heartbeat import DATABASE_ERRORS, Heartbeat
-from octasplat.workers.worker.job_inputs import read_inputs
+from octasplat.workers.worker.job_inputs import fetch_photographs, read_inputs
 from octasplat.workers.worker.job_kinds import JobKind, get_job_kind
 from octasplat.workers.worker.job_kinds.stored_options import resolve_here
 from octasplat.workers.worker.kernels import compile_for_job
@@ -174,10 +174,6 @@ class Supervisor:
             fetched = self._workspace.stored_frames.fetched(checkpoint.files)
             copied += sum(file.size_bytes for file in fetched)
         await asyncio.to_thread(self._context.disk_space.ensure_workspace, copied)
-        dataset = inputs.dataset
-        if dataset is not None and (kind.needs == "dataset" or kind.needs_photographs(options)):
-            title, files = dataset.name, inputs.photographs
-            scene = await asyncio.to_thread(self._workspace.fetch_dataset, dataset.id, files, dataset.name)
         if kind.needs == "result":
             await asyncio.to_thread(self._workspace.fetch_source, inputs.artifacts, kind.source_files)
         if inputs.named:
@@ -187,6 +183,10 @@ class Supervisor:
         if inputs.others and (job.root_id is not None or is_restored):
             lost = await asyncio.to_thread(self._workspace.fetch_from_others, inputs.others)
             await self._attempt.drop_lost_blocks(lost)
+        dataset = inputs.dataset
+        if dataset is not None and (kind.needs == "dataset" or kind.needs_photographs(options)):
+            title = dataset.name
+            scene = await asyncio.to_thread(fetch_photographs, self._workspace, kind, options, inputs)
         begins_with = None
         if kind.starts_from_result(options) and not self._workspace.has_start():
             starts = inputs.starts

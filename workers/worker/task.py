@@ -22,6 +22,9 @@ MOVED_RESULTS_FILE = "moved_results.json"
 INFO_FILE = "info.json"
 """The result that tells what is in a scene."""
 
+BLOCKS_FOLDER = "blocks"
+"""The plan of a scene in blocks and its pieces, in the engine's output folder."""
+
 POSES_FOLDER = "poses"
 """Poses that the engine found, in its output folder and among the results."""
 

@@ -4,12 +4,10 @@ import contextlib
 import json
 import logging
 import math
-import os
 import re
-import shutil
 import time
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import IO
 
@@ -37,11 +35,18 @@ from octasplat.workers.storage.trees import (
 )
 from octasplat.workers.storage.untrusted_folder import UntrustedFolder
 from octasplat.workers.worker.checkpoint import Checkpoint
+from octasplat.workers.worker.dataset_folder import DatasetFolder
 from octasplat.workers.worker.media_types import media_type
 from octasplat.workers.worker.start_files import START_RECORD
 from octasplat.workers.worker.stored_frames import StoredFrames, removes_stored_frames
-from octasplat.workers.worker.task import FILES_FOLDER, POSES_FOLDER, RESULTS_FOLDER, RUN_FOLDER
-from octasplat.workers.worker.workspace_locks import LOCK_FILE, lock_dataset_folder, open_locked
+from octasplat.workers.worker.task import (
+    BLOCKS_FOLDER,
+    FILES_FOLDER,
+    POSES_FOLDER,
+    RESULTS_FOLDER,
+    RUN_FOLDER,
+)
+from octasplat.workers.worker.workspace_locks import LOCK_FILE, open_locked
 
 logger = logging.getLogger(__name__)
 
@@ -51,7 +56,7 @@ _CHECKPOINT_FILES = (
     "run/plan.json", "run/georeference.json", "run/scene.ply", "run/checkpoints/best.npz",
     "run/start/best.npz", "run/start/views.json", START_RECORD,
 )  # fmt: skip
-_BLOCKS_FOLDER = "run/blocks"
+_BLOCKS = f"{RUN_FOLDER}/{BLOCKS_FOLDER}"
 _BLOCK = re.compile(r"block_\d+")
 """The pieces of which each has a job of its own."""
 _MAX_TRIES = 5
@@ -75,8 +80,7 @@ class Workspace:
         self.folder = root / "attempts" / f"{job.id}.{job.attempt}"
         self._lock: IO[bytes] | None = None
         self._user: JobUser | None = None
-        self._dataset_lock: IO[bytes] | None = None
-        self._dataset: Path | None = None
+        self._dataset: DatasetFolder | None = None
         self.stored_frames = StoredFrames(self.folder, are_removed=removes_stored_frames(job))
         self._own_block = f"block_{job.options['number']:03d}" if job.role == "block" else None
         self._peak_used_bytes = 0
@@ -103,7 +107,7 @@ class Workspace:
             self._user = take_user(uids, self._root)
             give_folder(self.folder, self._user.uid)
             if self._dataset is not None:
-                open_for_reading(self._dataset.parent)
+                open_for_reading(self._dataset.place.parent)
         return self._user.uid
 
     def close(self) -> None:
@@ -116,9 +120,9 @@ class Workspace:
         if self._lock is not None:
             self._lock.close()
             self._lock = None
-        if self._dataset_lock is not None:
-            self._dataset_lock.close()
-            self._dataset_lock = None
+        if self._dataset is not None:
+            self._dataset.close()
+            self._dataset = None
 
     def used_bytes(self) -> int:
         """Return the disk usage of the folder, without files shared with the storage.
@@ -142,31 +146,27 @@ class Workspace:
             self.used_bytes()
         return self._peak_used_bytes
 
-    def fetch_dataset(self, dataset_id: uuid.UUID, files: Sequence[DatasetFile], name: str) -> Path:
-        """Fetch the photographs into a folder shared by all attempts here; its files must not be changed.
+    def fetch_dataset(
+        self,
+        dataset_id: uuid.UUID,
+        files: Sequence[DatasetFile],
+        name: str,
+        needed: Collection[str] | None = None,
+    ) -> Path:
+        """Fetch photographs into a folder shared by all attempts here; its files must not be changed.
+
+        Args:
+            dataset_id: of the dataset.
+            files: all of its files; those that are not fetched may be empty.
+            name: of the dataset.
+            needed: paths of the files to fetch; None fetches all.
 
         Raises:
             StorageError: a photograph is gone or damaged, or the folder cannot be written.
         """
-        folder = self._root / "datasets" / str(dataset_id)
-        with translate_os_errors(folder):
-            self._dataset_lock = lock_dataset_folder(folder)
-            place = folder / (re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_")[:60] or "scene")
-            if not place.exists():
-                # Other attempts look for the final name, which only a complete folder gets.
-                partial = folder / f".{uuid.uuid4().hex}.partial"
-                try:
-                    fetch_tree(self.storage, _tree_files(files), partial)
-                    try:
-                        partial.rename(place)
-                    except OSError:
-                        if not place.exists():  # else another attempt was faster
-                            raise
-                finally:
-                    shutil.rmtree(partial, ignore_errors=True)
-            os.utime(folder)  # the sweep goes by this time
-        self._dataset = place
-        return place
+        self._dataset = DatasetFolder(self._root, dataset_id, name)
+        self._dataset.fill(self.storage, files, needed)
+        return self._dataset.place
 
     def fetch_files(self, files: Sequence[DatasetFile]) -> None:
         """Fetch the files that the options name; they must not be changed."""
@@ -360,15 +360,15 @@ def _piece_files(folder: UntrustedFolder, own_block: str | None) -> Iterator[str
         own_block: the block of its job; None for the whole, which goes without those of its blocks.
     """
     newest: dict[str, str] = {}
-    for name in sorted(folder.names(_BLOCKS_FOLDER)):
+    for name in sorted(folder.names(_BLOCKS)):
         piece, _, rest = name.partition("/")
         if (piece != own_block) if own_block is not None else _BLOCK.fullmatch(piece):
             continue
         if not rest or rest in ("best.npz", "piece.json"):
-            yield f"{_BLOCKS_FOLDER}/{name}"
+            yield f"{_BLOCKS}/{name}"
         elif re.fullmatch(r"checkpoints/(iteration_\d+|best)\.npz", rest):
             newest[f"{piece}/{'best' if rest.endswith('best.npz') else 'iteration'}"] = name
-    yield from (f"{_BLOCKS_FOLDER}/{name}" for name in newest.values())
+    yield from (f"{_BLOCKS}/{name}" for name in newest.values())
 
 
 def _directly_below(folder: UntrustedFolder, below: str) -> list[str]:

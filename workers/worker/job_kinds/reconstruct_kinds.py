@@ -1,10 +1,12 @@
 """Kinds of jobs that reconstruct a scene: the whole of it, and one of its blocks."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from pydantic import Field
 
+from octasplat.engine.blocks.block_photographs import read_block_photographs
 from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.block_options import BlockOptions, check_block_options, parse_memory
 from octasplat.engine.operations.cost_model import (
@@ -21,6 +23,7 @@ from octasplat.engine.train.config import MAX_PLANNED_ITERATIONS, iteration_coun
 from octasplat.workers.worker.job_kinds.operation_kind import OperationKind
 from octasplat.workers.worker.job_kinds.registry import JobKind
 from octasplat.workers.worker.job_kinds.resource_limits import ResourceDemand
+from octasplat.workers.worker.task import BLOCKS_FOLDER
 
 BLOCK_KIND = "reconstruct_block"
 _PROGRAMS = "octasplat.workers.worker.reconstruct_handler"
@@ -181,6 +184,11 @@ class BlockKind(JobKind[BlockJobConfig]):
             program=f"{_PROGRAMS}:train_block",
             stages=("load", "train"),
         )
+
+    def needed_files(self, options: BlockJobConfig, run: Path, names: Sequence[str]) -> set[str] | None:
+        """Return the photographs that the plan gives the block; None where the plan is one of old."""
+        known = read_block_photographs(run / BLOCKS_FOLDER)
+        return None if known is None else known.needed_files(options.number, names)
 
 
 def _complete(

@@ -1,8 +1,9 @@
 """Base class of job kinds, and their registry."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import cache
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, Literal
 
 from pydantic import BaseModel, ValidationError
@@ -100,6 +101,19 @@ class JobKind(Generic[OptionsT]):
     def needs_photographs(self, options: OptionsT) -> bool:
         """Return whether it reads the photographs of the source job as well."""
         return False
+
+    def needed_files(self, options: OptionsT, run: Path, names: Sequence[str]) -> Collection[str] | None:
+        """Return the files of its dataset without which the work cannot be done; None for all.
+
+        Args:
+            options: of the job.
+            run: the engine's output folder, with what earlier attempts and other jobs have left there.
+            names: paths of all files of the dataset.
+
+        Raises:
+            CheckpointError: what tells so is damaged.
+        """
+        return None
 
     def for_other_photographs(self, options: OptionsT) -> OptionsT:
         """Return the options as they are kept where the job names photographs of its own."""

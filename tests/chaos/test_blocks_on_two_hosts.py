@@ -1,0 +1,73 @@
+"""A scene in blocks on two hosts that share a database and an S3 store only, of which one dies for good."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from octasplat.engine.pipeline import BlockRequest, reconstruct
+from octasplat.workers.db.rows import Job
+from octasplat.workers.queue.block_jobs import blocks_of
+from octasplat.workers.worker.job_kinds import get_job_kind
+from octasplat.workers.worker.job_kinds.reconstruct_kinds import ReconstructJobConfig
+from tests.support.stored_dataset import store_dataset
+from tests.support.two_hosts import Hosts, two
+from tests.support.wall_dataset import make_wall_dataset
+from tests.support.worker_harness import kill_tree
+
+__all__ = ["two"]
+
+pytestmark = pytest.mark.heavy
+
+MAX_WAIT_SECONDS = 1200.0
+"""Several trainings follow each other, each in a process that begins anew."""
+TRAIN = {
+    **{"iterations": 120, "rays_per_batch": 256, "sh_degree": 1, "max_gaussians": 600, "initial_points": 300},
+    **{"probe_rays": 256, "checkpoint_every": 10, "background": "learnt"},
+}
+REQUESTED = {"train": TRAIN, "test_every": 4, "exports": ["mesh.ply"], "blocks": 2}
+SHOWN = {1: {1, 2, 3, 5, 6, 7, 9, 10}, 2: {6, 7, 9, 10, 11, 13, 14, 15}}
+"""Photographs of the wall that train each block."""
+
+
+def test_block_job_is_completed_by_the_host_that_lives(two: Hosts, tmp_path: Path) -> None:
+    scene = make_wall_dataset(tmp_path / "wall")
+    complete = get_job_kind("reconstruct").resolve(REQUESTED)
+    assert isinstance(complete, ReconstructJobConfig)
+    config = complete.run_config()
+    alone = reconstruct(scene, tmp_path / "alone", config, threads=1, blocks=BlockRequest(count=2))
+    bench = two.bench
+    first = two.worker(0)
+    dataset_id = store_dataset(bench, scene)
+    root = bench.submit("reconstruct", dataset_id=dataset_id, requested=REQUESTED)
+
+    def blocks() -> list[Job]:
+        found: list[Job] = bench.run_query(lambda c: blocks_of(c, [root]))
+        return found
+
+    bench.wait(root, lambda job: job.worker == "host0", MAX_WAIT_SECONDS)
+    two.worker(1)
+    bench.wait(
+        root,
+        lambda _: {b.worker for b in blocks()} == {"host0", "host1"} and all(b.checkpoint for b in blocks()),
+        MAX_WAIT_SECONDS,
+    )
+    # The second host has the photographs of its block, and no others.
+    busy = {block.worker: block for block in blocks()}
+    (place,) = (two.data(1) / "work" / "datasets" / str(dataset_id)).glob("[!.]*/images")
+    there = {int(path.stem) for path in place.iterdir() if path.stat().st_size}
+    assert there == SHOWN[busy["host1"].options["number"]] and len(list(place.iterdir())) == 16
+
+    two.found[0].disconnect()
+    kill_tree(first)
+    job = bench.wait_until_finished(root, MAX_WAIT_SECONDS)
+    assert (job.state, job.error, job.worker) == ("succeeded", None, "host1")
+    lost = blocks()[busy["host0"].options["number"] - 1]
+    assert (lost.worker, lost.attempt) == ("host1", 2)
+    assert [event.kind for event in bench.events(lost.id)].count("resumed") == 1
+    results = bench.results(root)
+    for name in ("scene.ply", "mesh.ply", "background.exr", "held_out.json", "views.json"):
+        assert results[name] == (alone / name).read_bytes(), name
+    assert list(json.loads(results["training.json"])["pieces"]) == [
+        "coarse", "block_001", "block_002", "finish",
+    ]  # fmt: skip
