@@ -8,10 +8,13 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from octasplat.engine.core.events import CheckpointWritten, Event
+from octasplat.engine.files.gaussian_ply import read_gaussian_ply
 from octasplat.engine.pipeline import BlockRequest, reconstruct
+from octasplat.engine.train.loop.checkpoint import load_best
 from octasplat.workers.db.rows import DatasetFile, Job
 from octasplat.workers.storage.local import LocalStorage
 from octasplat.workers.storage.trees import TreeFile
@@ -19,6 +22,7 @@ from octasplat.workers.worker.checkpoint import Checkpoint, plan_digest
 from octasplat.workers.worker.job_inputs import JobInputs, fetch_photographs
 from octasplat.workers.worker.job_kinds import get_job_kind
 from octasplat.workers.worker.job_kinds.reconstruct_kinds import ReconstructJobConfig
+from octasplat.workers.worker.live_scene import LiveSceneWritten
 from octasplat.workers.worker.reconstruct_handler import reconstruct as run_whole
 from octasplat.workers.worker.reconstruct_handler import train_block
 from octasplat.workers.worker.task import BlocksPlanned, Task
@@ -101,6 +105,14 @@ def test_programs_hand_over_what_makes_the_bytes_of_one_process(scene: Path, tmp
     assert planned.numbers == (1, 2) and planned.first_iterations == 15
     assert planned.total_iterations == 15 + 2 * 30 + 20
     assert not (first.folder / "results").exists()
+    # The points are shown first, and then the coarse scene.
+    shown_scenes = [event for event in events if isinstance(event, LiveSceneWritten)]
+    coarse = load_best(first.folder / "run" / "blocks" / "coarse").gaussians
+    assert [event.step for event in shown_scenes] == [0, 15] and shown_scenes[1].gaussians == len(coarse)
+    live = read_gaussian_ply(first.folder / "run" / shown_scenes[1].path)[0]
+    assert np.array_equal(live.means_world, coarse.means_world)
+    cameras = json.loads((first.folder / "run" / shown_scenes[1].views).read_text())["views"]
+    assert [camera["held_out"] for camera in cameras] == [view % 4 == 0 for view in range(16)]
     checkpoint = first.store_checkpoint("train", 15)
     assert checkpoint is not None
     names = {file.path.removeprefix("run/") for file in checkpoint.files}
@@ -141,7 +153,7 @@ def test_programs_hand_over_what_makes_the_bytes_of_one_process(scene: Path, tmp
     last.fetch_from_others(made)
     photographs = fetch_photographs(last, kind, complete, inputs)
     events, _ = run_task(run_whole, last, options, photographs)
-    assert not any(isinstance(event, BlocksPlanned) for event in events)
+    assert not any(isinstance(event, BlocksPlanned | LiveSceneWritten) for event in events)
     steps = [event.iteration for event in events if isinstance(event, CheckpointWritten)]
     assert steps and min(steps) >= 15 + 2 * 30  # they count what was before
     for name in ("scene.ply", "mesh.ply", "background.exr", "views.json", "held_out.json"):

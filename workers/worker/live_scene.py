@@ -13,6 +13,7 @@ from octasplat.engine.core.errors import OctasplatError
 from octasplat.engine.core.events import Event, EventListener
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset import Dataset, SparsePoints, Viewpoints, load_dataset_model, scene_extent
+from octasplat.engine.dataset.views_file import SplitViewpoints
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.train.initialization.initial_gaussians import gaussians_from_points
@@ -68,6 +69,11 @@ class LiveSceneWriter:
         except OctasplatError:
             return
         self._write(0, gaussians, found, set(found.held_out or ()))
+
+    def write_state(self, step: int, gaussians: FlatGaussians, views: SplitViewpoints) -> None:
+        """Write a state at once, with the cameras of its run."""
+        held_out = {views.views[index].name for index in views.test_indices}
+        self._write(step, heaviest(gaussians, MAX_GAUSSIANS), views, held_out)
 
     def __call__(self, iteration: int, dataset: Dataset, gaussians: FlatGaussians) -> None:
         """Write the state of the training if that is due."""

@@ -3,12 +3,21 @@
 import shutil
 
 from octasplat.engine.blocks.block_map import draw_block_map
-from octasplat.engine.blocks.scene_plan import ScenePlan, block_name
+from octasplat.engine.blocks.scene_plan import COARSE, ScenePlan, block_name, has_plan
 from octasplat.engine.core.compiling import report_compilation
 from octasplat.engine.core.errors import CheckpointError, ConfigError, OctasplatError
-from octasplat.engine.core.events import Event, PhaseFinished, PhaseProgress, Warned, broadcast
+from octasplat.engine.core.events import (
+    Event,
+    EventListener,
+    PhaseFinished,
+    PhaseProgress,
+    Warned,
+    broadcast,
+    ignore_events,
+)
 from octasplat.engine.core.progress import stop_when_asked
 from octasplat.engine.dataset import Dataset, load_dataset_model
+from octasplat.engine.dataset.views_file import read_views
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.operations.block_options import block_request
 from octasplat.engine.operations.photograph_sizes import photograph_sizes
@@ -29,10 +38,12 @@ from octasplat.engine.runs.run_folder import (
     CONFIG,
     SCENE,
     START,
+    VIEWS,
     found_model_folder,
 )
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.protocol import Tracer
+from octasplat.engine.train.loop.checkpoint import load_best
 from octasplat.workers.worker.job_kinds.reconstruct_kinds import BlockJobConfig, ReconstructJobConfig
 from octasplat.workers.worker.live_scene import LiveSceneWriter
 from octasplat.workers.worker.preview import PREVIEW_FILE, PreviewRenderer, PreviewWritten
@@ -81,13 +92,16 @@ def train_block(task: Task) -> None:
         publish_file(task, path, path.relative_to(task.run).as_posix())
 
 
-def _plan_blocks(task: Task, options: ReconstructJobConfig, blocks: BlockRequest) -> bool:
+def _plan_blocks(
+    task: Task, options: ReconstructJobConfig, blocks: BlockRequest, show_points: EventListener
+) -> bool:
     """Plan the blocks of a run, if it has several; return whether they are to be trained by other jobs."""
     if planned_blocks(task.run) is None:
-        _run_step(task, options, PlanBlocks(), blocks)
+        _run_step(task, options, PlanBlocks(), blocks, also=show_points)
     if (plan := planned_blocks(task.run)) is None or not missing_blocks(task.run, plan):
         return False
     _show_map(task, options, plan)
+    _show_coarse_scene(task, options, plan)
     lengths = {number: length for number, length in enumerate(plan.iterations, start=1) if length}
     total = sum(plan.expected_iterations().values())
     task.progress(BlocksPlanned(tuple(lengths), tuple(lengths.values()), plan.coarse_iterations, total))
@@ -112,11 +126,19 @@ def _show_map(task: Task, options: ReconstructJobConfig, plan: ScenePlan) -> Non
     task.progress(PreviewWritten(PREVIEW_FILE, plan.coarse_iterations, None, positions))
 
 
+def _show_coarse_scene(task: Task, options: ReconstructJobConfig, plan: ScenePlan) -> None:
+    """Let the coarse scene be the live scene for as long as blocks are trained."""
+    coarse = load_best(task.run / BLOCKS / COARSE).gaussians
+    views = read_views(task.run / VIEWS).viewpoints(options.max_side)
+    LiveSceneWriter(task.run, task.progress).write_state(plan.coarse_iterations, coarse, views)
+
+
 def _run_step(
     task: Task,
     options: ReconstructJobConfig,
     step: PlanBlocks | TrainBlock,
     blocks: BlockRequest | None = None,
+    also: EventListener = ignore_events,
 ) -> None:
     """Run one step of a run after its photographs are open."""
     assert task.scene is not None
@@ -127,7 +149,7 @@ def _run_step(
             options.run_config(),
             resume=True,
             threads=task.threads,
-            progress=stop_when_asked(task.progress, task.should_stop),
+            progress=stop_when_asked(broadcast([task.progress, also]), task.should_stop),
             should_stop=task.should_stop,
             blocks=blocks,
             steps=(step,),
@@ -140,24 +162,24 @@ def _run_reconstruction(task: Task) -> None:
     config = options.run_config()
     sizes = photograph_sizes(task.scene) if options.memory is not None else []
     blocks = block_request(options, config, sizes)
-    if blocks is not None and blocks.count != 1 and _plan_blocks(task, options, blocks):
-        return
-
-    preview = PreviewRenderer(task.run, config.evaluation_background, task.progress)
     live = LiveSceneWriter(task.run, task.progress)
+
+    def show_points(event: Event) -> None:
+        # As soon as poses are found, and again where they are mended; never in the place of a later state.
+        if isinstance(event, PhaseFinished) and event.stage in _STAGES_OF_POSES:
+            assert task.scene is not None
+            if not any((task.run / CHECKPOINTS).glob("*.npz")) and not has_plan(task.run / BLOCKS):
+                live.write_points(task.scene, found_model_folder(task.run), config.model)
+
+    if blocks is not None and blocks.count != 1 and _plan_blocks(task, options, blocks, show_points):
+        return
+    preview = PreviewRenderer(task.run, config.evaluation_background, task.progress)
 
     def show_step(
         iteration: int, dataset: Dataset, tracer: Tracer, shading: ShadingModel, gaussians: FlatGaussians
     ) -> None:
         preview(iteration, dataset, tracer, shading)
         live(iteration, dataset, gaussians)
-
-    def show_points(event: Event) -> None:
-        # As soon as poses are found, and again where they are mended; never in the place of a later state.
-        if isinstance(event, PhaseFinished) and event.stage in _STAGES_OF_POSES:
-            assert task.scene is not None
-            if not any((task.run / CHECKPOINTS).glob("*.npz")):
-                live.write_points(task.scene, found_model_folder(task.run), config.model)
 
     def publish_finished(event: Event) -> None:
         # Whatever becomes of the rest, even if this process is killed.

@@ -239,10 +239,9 @@ class Reporter:
                 await self._store_live_scene(live_scene)
         except asyncio.CancelledError:
             # Pending again, so that finish() stores what was interrupted.
-            self._wanted_checkpoint, self._preview = (
-                self._wanted_checkpoint or pending,
-                self._preview or preview,
-            )
+            self._wanted_checkpoint = self._wanted_checkpoint or pending
+            self._preview = self._preview or preview
+            self._live_scene = self._live_scene or live_scene
             raise
         except (StorageError, *_IGNORED_ERRORS) as error:
             logger.warning("a %s of job %s was not stored: %s", what, self._attempt.job.id, error)
