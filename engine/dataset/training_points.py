@@ -30,8 +30,9 @@ def is_observed_by(
     row, is_there = points.rows_of(observations.point)
     counted = np.isin(observations.view, views) & is_there
     # A track may name a photograph twice, which tells no more than once.
-    once = np.unique(np.stack([row[counted], observations.view[counted]], axis=1), axis=0)
-    known = np.bincount(once[:, 0], minlength=len(points)) >= MIN_OBSERVATIONS
+    stride = int(observations.view.max()) + 1
+    once = np.unique(row[counted] * stride + observations.view[counted])
+    known = np.bincount(once // stride, minlength=len(points)) >= MIN_OBSERVATIONS
     return known if known.any() else np.ones(len(points), np.bool_)
 
 

@@ -46,10 +46,12 @@ def relative_log_brightness(dataset: TrackedTrainingData) -> Float64[np.ndarray,
     valid = (weight > 0) & (brightnesses > MIN_VALUE) & (brightnesses < MAX_VALUE)
     view, point, levels = view[valid], point[valid], np.log(brightnesses[valid])
     views = np.zeros(count)
+    medians_of_points = _GroupMedians(point, int(point.max(initial=0)) + 1)
+    medians_of_views = _GroupMedians(view, count)
     for _ in range(ROUNDS):
         # alternating: points given the views, then views given the points
-        points = _group_medians(levels - views[view], point, int(point.max(initial=0)) + 1)
-        views = _group_medians(levels - points[point], view, count)
+        points = medians_of_points(levels - views[view])
+        views = medians_of_views(levels - points[point])
     known = np.bincount(view, minlength=count) >= MIN_POINTS
     if known.any():
         brightness[known] = views[known] - np.median(views[known])
@@ -93,15 +95,31 @@ def resolve_exposure(
     return reason is not None, reason
 
 
-def _group_medians(
-    values: Float64[np.ndarray, " k"], group: Int64[np.ndarray, " k"], count: int
-) -> Float64[np.ndarray, " g"]:
-    """Return the median of each group's values; 0 where there are none."""
-    order = np.lexsort((values, group))
-    sizes = np.bincount(group, minlength=count)
-    starts = np.cumsum(sizes) - sizes
-    is_filled = sizes > 0
-    sorted_values, medians = values[order], np.zeros(count)
-    low, high = (starts + (sizes - 1) // 2)[is_filled], (starts + sizes // 2)[is_filled]
-    medians[is_filled] = (sorted_values[low] + sorted_values[high]) / 2
-    return medians
+class _GroupMedians:
+    """Medians of the values of groups that stay the same.
+
+    Args:
+        group: of each value.
+        count: number of groups.
+    """
+
+    def __init__(self, group: Int64[np.ndarray, " k"], count: int) -> None:
+        self._count = count
+        order = np.argsort(group, kind="stable")
+        sizes = np.bincount(group, minlength=count)
+        starts = np.cumsum(sizes) - sizes
+        # Groups of one size are rows of one matrix, of which all medians are taken at once.
+        self._matrices = [
+            (same, order[starts[same][:, None] + np.arange(size)])
+            for size in np.unique(sizes[sizes > 0]).tolist()
+            for same in [np.flatnonzero(sizes == size)]
+        ]
+
+    def __call__(self, values: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, " g"]:
+        """Return the median of each group; 0 where it has no values."""
+        medians = np.zeros(self._count)
+        for groups, places in self._matrices:
+            low, high = (places.shape[1] - 1) // 2, places.shape[1] // 2
+            parted = np.partition(values[places], (low, high), axis=1)
+            medians[groups] = (parted[:, low] + parted[:, high]) / 2
+        return medians
