@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from octasplat.engine.pipeline import BlockRequest, reconstruct
+from octasplat.workers.db.live_scenes import get_live_scene
 from octasplat.workers.db.rows import Job
 from octasplat.workers.queue.block_jobs import blocks_of
 from octasplat.workers.worker.job_kinds import get_job_kind
@@ -57,6 +58,10 @@ def test_block_job_is_completed_by_the_host_that_lives(two: Hosts, tmp_path: Pat
     (place,) = (two.data(1) / "work" / "datasets" / str(dataset_id)).glob("[!.]*/images")
     there = {int(path.stem) for path in place.iterdir() if path.stat().st_size}
     assert there == SHOWN[busy["host1"].options["number"]] and len(list(place.iterdir())) == 16
+
+    # The coarse scene is what the job shows meanwhile.
+    shown = bench.run_query(lambda c: get_live_scene(c, root))
+    assert shown is not None and shown.step == 60
 
     two.found[0].disconnect()
     kill_tree(first)
