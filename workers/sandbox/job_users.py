@@ -113,11 +113,14 @@ def open_for_reading(folder: Path) -> None:
     folder.chmod(0o755)
     for _, folders, files, fd in os.fwalk(folder, follow_symlinks=False):
         for name in (*folders, *files):
-            facts = os.stat(name, dir_fd=fd, follow_symlinks=False)
-            if stat.S_ISDIR(facts.st_mode):
-                os.chmod(name, 0o755, dir_fd=fd)  # noqa: S103 - their parents are not listed
-            elif facts.st_nlink == 1:  # another has access of the store's own
-                os.chmod(name, 0o444, dir_fd=fd)
+            with contextlib.suppress(
+                FileNotFoundError
+            ):  # another attempt has fetched and renamed it
+                facts = os.stat(name, dir_fd=fd, follow_symlinks=False)
+                if stat.S_ISDIR(facts.st_mode):
+                    os.chmod(name, 0o755, dir_fd=fd)  # noqa: S103 - their parents are not listed
+                elif facts.st_nlink == 1:  # another has access of the store's own
+                    os.chmod(name, 0o444, dir_fd=fd)
 
 
 def become_user(uid: int, home: Path) -> None:
