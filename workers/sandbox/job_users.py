@@ -113,9 +113,7 @@ def open_for_reading(folder: Path) -> None:
     folder.chmod(0o755)
     for _, folders, files, fd in os.fwalk(folder, follow_symlinks=False):
         for name in (*folders, *files):
-            with contextlib.suppress(
-                FileNotFoundError
-            ):  # another attempt has fetched and renamed it
+            with contextlib.suppress(FileNotFoundError):  # another attempt has fetched and renamed it
                 facts = os.stat(name, dir_fd=fd, follow_symlinks=False)
                 if stat.S_ISDIR(facts.st_mode):
                     os.chmod(name, 0o755, dir_fd=fd)  # noqa: S103 - their parents are not listed
