@@ -22,9 +22,8 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from octasplat.engine.core.color import linear_to_srgb, srgb_to_linear
-from octasplat.engine.pathtracing.kernels.film import accumulate_pixels
+from octasplat.engine.pathtracing.kernels.film import FilmArrays, add_paths, allocate_film
 from octasplat.engine.pathtracing.kernels.path_args import PathArrays
-from octasplat.engine.pathtracing.kernels.scatter import FLAG_GAUSSIAN_SURFACE
 
 ToneCurve = Literal["none", "reinhard", "filmic"]
 DenoiseFn = Callable[
@@ -32,7 +31,7 @@ DenoiseFn = Callable[
     Float32[np.ndarray, "h w 3"],
 ]
 """Takes noise from a linear image, guided by the colors and normals of surfaces where they are given."""
-_NO_FACTORS = np.empty(0, np.float32)
+_NO_SUMS = allocate_film(0)
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 _DARK = 1e-6
 
@@ -72,66 +71,29 @@ class Film:
         self, height: int, width: int, *, has_layers: bool = False, has_guides: bool = False
     ) -> None:
         self._shape = (height, width)
-        count = height * width
-        self._layer, self._light, self._shade, self._albedo, self._normals = np.zeros((5, count, 3))
-        self._transmittance, self._coverage, self._mesh_visibility, self._samples, self._front = np.zeros(
-            (5, count)
-        )
-        self._front_light = np.zeros((count, 3))
+        self._sums = allocate_film(height * width, has_guides=has_guides)
         self.plate = Film(height, width) if has_layers else None
         self._without_meshes = Film(height, width) if has_layers else None
-        self._has_guides = has_guides
 
-    def add(
-        self,
-        paths: PathArrays,
-        pixels: Int64[np.ndarray, " n"],
-        path_factors: Float32[np.ndarray, " p"] | None = None,
-    ) -> None:
-        """Add finished paths, equally many for each of ``pixels``, those of one pixel consecutive.
+    @property
+    def sums(self) -> FilmArrays:
+        """Return the sums, for kernels."""
+        return self._sums
 
-        Args:
-            paths: to add.
-            pixels: where they begin.
-            path_factors: 1 for those that count, 0 for the others; None for all.
-        """
+    @property
+    def sums_without_meshes(self) -> FilmArrays:
+        """Return the sums of paths that meet no mesh, for kernels; no rows where the film keeps none."""
+        return _NO_SUMS if self._without_meshes is None else self._without_meshes.sums
+
+    def add(self, paths: PathArrays, pixels: Int64[np.ndarray, " n"]) -> None:
+        """Add finished paths, equally many for each of ``pixels``, those of one pixel consecutive."""
         each = len(paths.keys) // len(pixels)
-
-        def add(
-            sums: Float64[np.ndarray, "..."],
-            values: Float32[np.ndarray, "..."],
-            factors: Float32[np.ndarray, " f"] = _NO_FACTORS if path_factors is None else path_factors,
-        ) -> None:
-            accumulate_pixels(
-                values.reshape(len(values), -1), factors, each, pixels, sums.reshape(len(sums), -1)
-            )
-
-        # a path either ends at a surface of Gaussians or goes on behind the layer
-        front = (paths.flags & FLAG_GAUSSIAN_SURFACE != 0).astype(np.float32)
-        through = paths.transmittance * (1 - front)
-        add(self._layer, paths.layer_srgb)
-        add(self._light, paths.radiance_linear, through if path_factors is None else through * path_factors)
-        add(self._shade, paths.shading_factor)
-        add(self._transmittance, through)
-        add(self._coverage, paths.coverage)
-        add(self._front, front)
-        add(self._front_light, paths.radiance_linear, front if path_factors is None else front * path_factors)
-        if path_factors is not None:
-            add(self._samples, path_factors)
-            return
-        self._samples[pixels] += each  # without factors every path counts
-        if self._has_guides:
-            add(self._albedo, paths.albedo_linear)
-            add(self._normals, paths.normals_world)
-        if self._has_guides or self._without_meshes is not None:
-            add(self._mesh_visibility, paths.mesh_visibility)
-        if self._without_meshes is not None:
-            self._without_meshes.add(paths, pixels, (paths.mesh_visibility == 0.0).astype(np.float32))
+        add_paths(len(pixels), paths, each, pixels, 0, self.sums, self.sums_without_meshes)
 
     def gaussian_surface(self) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
         """Return the mean linear radiance of the visible Gaussians with materials, and their coverage."""
-        linear = _safe_divide(self._front_light, self._front[:, None])
-        coverage = self._front / np.maximum(self._samples, 1)
+        linear = _safe_divide(self._sums.front_linear, self._sums.front[:, None])
+        coverage = self._sums.front / np.maximum(self._sums.samples, 1)
         return linear.astype(np.float32).reshape(*self._shape, 3), coverage.astype(np.float32).reshape(
             self._shape
         )
@@ -143,39 +105,43 @@ class Film:
         return StageImage(
             np.clip(display, 0.0, 1.0).astype(np.float32).reshape(*self._shape, 3),
             self._to_image(linear),
-            self._to_image(self._coverage / np.maximum(self._samples, 1)),
+            self._to_image(self._sums.coverage / np.maximum(self._sums.samples, 1)),
             self._mesh_layers(linear),
         )
 
     def denoised(self, denoise: DenoiseFn) -> "Film":
         """Return the film with its lit part denoised; the Gaussians' own colors stay as they are."""
         film = copy.copy(self)
-        count = np.maximum(self._samples, 1)[:, None]
-        if self._mesh_visibility.any():
-            guides = (self._to_image(self._albedo / count), self._to_image(self._normals / count))
-            light = denoise(self._to_image(self._light / count), *guides)
+        count = np.maximum(self._sums.samples, 1)[:, None]
+        if self._sums.mesh_visibility.any():
+            guides = (
+                self._to_image(self._sums.albedo_linear / count),
+                self._to_image(self._sums.normals_world / count),
+            )
+            light = denoise(self._to_image(self._sums.light_linear / count), *guides)
             smooth = light.reshape(-1, 3).astype(np.float64) * count
             # the noise-free background behind no mesh stays
-            film._light = np.where(self._mesh_visibility[:, None] > 0.0, smooth, self._light)
+            is_mesh = self._sums.mesh_visibility[:, None] > 0.0
+            film._sums = film._sums._replace(light_linear=np.where(is_mesh, smooth, self._sums.light_linear))
         covered = self._covered()
-        shade = _safe_divide(self._shade, covered, 1.0)
+        shade = _safe_divide(self._sums.shading, covered, 1.0)
         if (np.abs(shade - 1.0) > _DARK).any():
             even = denoise(self._to_image(np.maximum(shade, 0.0)), None, None)
-            film._shade = even.reshape(-1, 3).astype(np.float64) * covered
+            film._sums = film._sums._replace(shading=even.reshape(-1, 3).astype(np.float64) * covered)
         if self._without_meshes is not None:
             film._without_meshes = self._without_meshes.denoised(denoise)
         return film
 
     def _linear_radiance(self, *, lit: bool = True) -> Float64[np.ndarray, "n 3"]:
         """Return linear values; without ``lit`` those of the Gaussians as trained."""
-        count = np.maximum(self._samples, 1)[:, None]
-        through, front = self._transmittance[:, None] / count, self._front[:, None] / count
+        count = np.maximum(self._sums.samples, 1)[:, None]
+        through, front = self._sums.transmittance[:, None] / count, self._sums.front[:, None] / count
         covered = np.maximum(1.0 - through - front, 0.0)
-        layer = self._layer / count
-        light = _safe_divide(self._light, self._transmittance[:, None])
-        surface = _safe_divide(self._front_light, self._front[:, None])
+        layer = self._sums.layer_srgb / count
+        light = _safe_divide(self._sums.light_linear, self._sums.transmittance[:, None])
+        surface = _safe_divide(self._sums.front_linear, self._sums.front[:, None])
         if lit:
-            shade = _safe_divide(self._shade, self._covered(), 1.0)
+            shade = _safe_divide(self._sums.shading, self._covered(), 1.0)
             # linear light is scaled, display values would change hue
             color = srgb_to_linear(_safe_divide(layer, covered)) * np.maximum(shade, 0.0)
             # an unlit color is not rounded twice
@@ -184,23 +150,23 @@ class Film:
         return np.asarray(srgb_to_linear(display))
 
     def _covered(self) -> Float64[np.ndarray, "n 1"]:
-        return (self._samples - self._transmittance - self._front)[:, None]
+        return (self._sums.samples - self._sums.transmittance - self._sums.front)[:, None]
 
     def _mesh_layers(self, picture: Float64[np.ndarray, "n 3"]) -> dict[str, Float32[np.ndarray, "h w"]]:
         if self._without_meshes is None or self.plate is None:
             return {}
         plain = self._without_meshes._linear_radiance(lit=False)
         # where the plain image is dark the ratio would be noise: no shadow there
-        is_lit = (self._without_meshes._samples > 0)[:, None] & (plain > _DARK)
+        is_lit = (self._without_meshes._sums.samples > 0)[:, None] & (plain > _DARK)
         shadow = np.where(is_lit, self._without_meshes._linear_radiance() / np.where(is_lit, plain, 1.0), 1.0)
         background = self.plate._linear_radiance(lit=False)
         behind = background * shadow
-        alpha = self._mesh_visibility / np.maximum(self._samples, 1)
+        alpha = self._sums.mesh_visibility / np.maximum(self._sums.samples, 1)
         # the least alpha for which picture - (1 - alpha) behind is not negative
         needed = np.where(behind > _DARK, 1.0 - picture / np.maximum(behind, _DARK), 0.0).max(axis=1)
         alpha = np.where(alpha > 0.0, np.clip(np.maximum(alpha, needed), 0.0, 1.0), 0.0)[:, None]
         mesh_light = np.where(alpha > 0.0, np.maximum(picture - (1.0 - alpha) * behind, 0.0), 0.0)
-        beyond = self.plate._coverage / np.maximum(self.plate._samples, 1)
+        beyond = self.plate._sums.coverage / np.maximum(self.plate._sums.samples, 1)
         parts = {
             "background": (background, beyond),
             "shadow": (shadow, np.clip(1.0 - shadow.mean(axis=1), 0.0, 1.0)),

@@ -10,9 +10,7 @@ from octasplat.engine.pathtracing.kernels.path_args import (
     BLOCK_SIZE,
     CameraRays,
     MeshHits,
-    PathArrays,
     PathBlock,
-    PathScratch,
     PathStart,
     allocate_media,
     allocate_paths,
@@ -55,30 +53,16 @@ class ImageBatches:
         )
 
 
-@dataclass(frozen=True)
-class Workspace:
-    """Buffers for one thread's paths, allocated once, as fresh memory costs time."""
-
-    scratch: PathScratch
-    all_paths: PathArrays
-    block: PathBlock
-
-    @classmethod
-    def allocate(cls, scratch: PathScratch) -> "Workspace":
-        """Return buffers for :data:`PATHS_PER_THREAD` paths."""
-        hits = MeshHits(
-            np.empty(BLOCK_SIZE, np.float32), np.empty(BLOCK_SIZE, np.int32),
-            np.empty((BLOCK_SIZE, 2), np.float32), allocate_media(BLOCK_SIZE),
-        )  # fmt: skip
-        block = PathBlock(
-            np.empty(BLOCK_SIZE, np.int32), hits, allocate_shadow_rays(BLOCK_SIZE),
-            np.empty((BLOCK_SIZE, 3), np.float32),
-        )  # fmt: skip
-        return cls(scratch, allocate_paths(PATHS_PER_THREAD), block)
-
-    def paths(self, count: int) -> PathArrays:
-        """Return views of the first ``count`` paths."""
-        return PathArrays(*(values[:count] for values in self.all_paths))
+def allocate_path_block() -> PathBlock:
+    """Return memory for a block of paths of one thread."""
+    hits = MeshHits(
+        np.empty(BLOCK_SIZE, np.float32), np.empty(BLOCK_SIZE, np.int32),
+        np.empty((BLOCK_SIZE, 2), np.float32), allocate_media(BLOCK_SIZE),
+    )  # fmt: skip
+    return PathBlock(
+        allocate_paths(BLOCK_SIZE), np.empty(BLOCK_SIZE, np.int32), hits, allocate_shadow_rays(BLOCK_SIZE),
+        np.empty((BLOCK_SIZE, 3), np.float32),
+    )  # fmt: skip
 
 
 def optical_axis(directions_world: Float32[np.ndarray, "h w 3"]) -> Float64[np.ndarray, "3"]:

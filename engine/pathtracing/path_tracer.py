@@ -33,6 +33,8 @@ from octasplat.engine.pathtracing.kernels.path_args import (
     CameraRays,
     MeshHits,
     PathArrays,
+    PathBlock,
+    PathScratch,
     ShadowRayArrays,
     SurfaceInteractions,
     allocate_media,
@@ -48,7 +50,7 @@ from octasplat.engine.pathtracing.path_batches import (
     PATHS_PER_THREAD,
     Batch,
     ImageBatches,
-    Workspace,
+    allocate_path_block,
     optical_axis,
 )
 from octasplat.engine.pathtracing.stage.model import Integrator, Stage
@@ -199,22 +201,19 @@ class PathTracer:
     def _trace_per_thread(self, film: Film, image: ImageBatches) -> Iterator[None]:
         """Trace paths among meshes only, a batch per thread; yield before each batch that is awaited."""
         scene, queries = self._scene.meshes.scene, self._scene.meshes.queries
-        free: Queue[Workspace] = Queue()
+        free: Queue[tuple[PathScratch, PathBlock]] = Queue()
         for scratch in self._scratches:
-            free.put(Workspace.allocate(scratch))
+            free.put((scratch, allocate_path_block()))
 
         def work(batch: Batch) -> None:
-            workspace = free.get()
+            scratch, block = free.get()
             try:
-                paths = workspace.paths(len(batch.pixels) * batch.paths_per_pixel)
-                start = image.start(batch)
                 trace_paths(
-                    len(paths.keys), workspace.scratch, self._integrator, start, scene, queries,
-                    image.t_min, INFINITE_T_MAX, paths, workspace.block,
+                    len(batch.pixels), scratch, self._integrator, image.start(batch), scene, queries,
+                    image.t_min, INFINITE_T_MAX, block, film.sums, film.sums_without_meshes,
                 )  # fmt: skip
-                film.add(paths, batch.pixels)
             finally:
-                free.put(workspace)
+                free.put((scratch, block))
 
         tasks = [self._pool.submit(work, batch) for batch in image.batches]
         try:

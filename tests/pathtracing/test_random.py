@@ -4,13 +4,29 @@ import numba
 import numpy as np
 from scipy.stats import qmc
 
-from octasplat.engine.pathtracing.kernels.sampler import fill_uniform, reverse_bits, sobol_reversed_bits
+from octasplat.engine.pathtracing.kernels.sampler import (
+    fill_pairs,
+    fill_uniform,
+    pixel_key,
+    reverse_bits,
+    sobol_reversed_bits,
+)
 
 
 @numba.njit
 def digits(index):
     first, second = sobol_reversed_bits(index)
     return reverse_bits(first), reverse_bits(second)
+
+
+@numba.njit
+def keys_of(seed, pixels):
+    return np.array([pixel_key(seed, pixel) for pixel in pixels], np.uint32)
+
+
+@numba.njit
+def fill_eight_at_a_time(keys, samples, count, first, out):
+    fill_pairs(keys, samples, count, first, out)
 
 
 def numbers(pixel: int, samples: int, pair: int = 0, seed: int = 1) -> np.ndarray:
@@ -45,3 +61,15 @@ def test_pixels_pairs_and_seeds_are_unlike() -> None:
     assert len(np.unique(some[:, 0])) == len(some)
     assert abs(np.corrcoef(some.T)[0, 1]) < 0.15 and abs(some.mean() - 0.5) < 0.05
     assert (some >= 0).all() and (some < 1).all()
+
+
+def test_eight_paths_at_a_time_have_the_numbers_of_each() -> None:
+    pixels, samples = np.arange(19) * 7919, np.arange(19) * 3449
+    out = np.empty((3, 2, 24))
+    room = np.zeros(24, np.uint32)
+    room[:19] = keys_of(5, pixels)
+    fill_eight_at_a_time(room, np.concatenate([samples, np.zeros(5)]).astype(np.int32), 19, 2, out)
+    for pair in range(3):
+        alone = np.empty((19, 2))
+        fill_uniform(5, pixels, samples, 2 + pair, alone)
+        np.testing.assert_array_equal(out[pair, :, :19].T, alone)

@@ -22,11 +22,11 @@ from octasplat.engine.pathtracing.kernels.surface import normalize
 from octasplat.engine.trace.kernels.native import njit_no_refcount
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def _fill_camera_samples(
-    scratch: PathScratch, seed: int, start: PathStart, place: int, number: int, count: int
+    scratch: PathScratch, seed: int, start: PathStart, place: int, number: int, count: int, pairs: int
 ) -> None:
-    """Write keys, sample numbers and the camera's uniform numbers of ``count`` paths, at most a block.
+    """Write keys, sample numbers and ``pairs`` of uniform numbers of ``count`` paths, at most a block.
 
     The first of them is number ``number`` of the pixel at ``place``.
     """
@@ -38,18 +38,19 @@ def _fill_camera_samples(
             key = pixel_key(seed, start.pixel_order[start.first_pixel + place])
         scratch.keys[n], scratch.samples[n] = key, start.first_sample + number
         number += 1
-    fill_pairs(scratch.keys, scratch.samples, count, 0, scratch.random_numbers[:CAMERA_SAMPLE_PAIRS])
+    fill_pairs(scratch.keys, scratch.samples, count, 0, scratch.random_numbers[:pairs])
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def _pixel_direction(directions: Float32[np.ndarray, "h w 3"], y: int, x: int, u: float, v: float) -> Vec3:
     """Return the direction through (u, v) of a pixel, by the slopes between its neighbours."""
     height, width, _ = directions.shape
     centre = directions[y, x]
     left, right = max(x - 1, 0), min(x + 1, width - 1)
     high, low = max(y - 1, 0), min(y + 1, height - 1)
-    along = (u - 0.5) / max(right - left, 1)  # one pixel at the picture's edges, else two
-    down = (v - 0.5) / max(low - high, 1)
+    # two pixels apart, or one at the picture's edges
+    along = (u - 0.5) * (0.5 if right - left == 2 else 1.0)
+    down = (v - 0.5) * (0.5 if low - high == 2 else 1.0)
     a, b = directions[y, left], directions[y, right]
     c, d = directions[high, x], directions[low, x]
     d_x, d_y, d_z = float(centre[0]), float(centre[1]), float(centre[2])
@@ -59,7 +60,7 @@ def _pixel_direction(directions: Float32[np.ndarray, "h w 3"], y: int, x: int, u
     return normalize(d_x, d_y, d_z)
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def reset_path(paths: PathArrays, k: int, origin: Vec3, direction: Vec3, flags: int) -> None:
     """Start a path: no radiance yet, unit throughput."""
     paths.origins_world[k, 0], paths.origins_world[k, 1], paths.origins_world[k, 2] = origin
@@ -75,7 +76,7 @@ def reset_path(paths: PathArrays, k: int, origin: Vec3, direction: Vec3, flags: 
     paths.flags[k], paths.is_alive[k] = flags, True
 
 
-@kernel(_nrt=False, error_model="numpy")
+@kernel(_nrt=False, error_model="numpy", fastmath={"contract"})
 def start_paths(
     first: int,
     last: int,
@@ -94,6 +95,7 @@ def start_paths(
     width = directions.shape[1]
     across_x, across_y, across_z, up_x, up_y, up_z = orthonormal_basis(axis[0], axis[1], axis[2])
     # --- the pixel: its place in the order, the number of the path in it, row and column ---
+    pairs = CAMERA_SAMPLE_PAIRS if camera.aperture > 0.0 else 1  # without a lens none for the place on it
     place, number = first // start.paths_per_pixel, first % start.paths_per_pixel - 1
     pixel = start.pixel_order[start.first_pixel + place]
     y, x = pixel // width, pixel % width
@@ -103,7 +105,7 @@ def start_paths(
         if number == start.paths_per_pixel:
             place, number = place + 1, 0
         if n == 0:
-            _fill_camera_samples(scratch, integrator.seed, start, place, number, last - k)
+            _fill_camera_samples(scratch, integrator.seed, start, place, number, last - k, pairs)
         if n == 0 or number == 0:
             pixel = start.pixel_order[start.first_pixel + place]
             y, x = pixel // width, pixel % width

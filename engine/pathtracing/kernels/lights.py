@@ -33,13 +33,13 @@ from octasplat.engine.trace.kernels.native import njit_no_refcount
 INFINITE_DISTANCE = 1e30
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def luminance(red: float, green: float, blue: float) -> float:
     """Return the luminance of linear Rec. 709 values."""
     return 0.2126 * red + 0.7152 * green + 0.0722 * blue
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def _spot_falloff(lights: LightArrays, l: int, way_x: float, way_y: float, way_z: float) -> float:
     """Return how much of a spot's intensity goes a way (a unit vector from the light)."""
     axis = lights.axes[l]
@@ -49,7 +49,7 @@ def _spot_falloff(lights: LightArrays, l: int, way_x: float, way_y: float, way_z
     return share * share
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def light_importance(lights: LightArrays, l: int, p_x: float, p_y: float, p_z: float) -> float:
     """Estimate the irradiance of a light at a surface at p that faces it; 0 only where it is exactly 0."""
     power = luminance(lights.rgb_linear[l, 0], lights.rgb_linear[l, 1], lights.rgb_linear[l, 2])
@@ -78,7 +78,7 @@ def light_importance(lights: LightArrays, l: int, p_x: float, p_y: float, p_z: f
     return power / squared
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def _light_weight(lights: LightArrays, l: int, p_x: float, p_y: float, p_z: float, is_mesh: bool) -> float:
     """Return :func:`light_importance`, or 0 of a light that does not light meshes where p lies on one."""
     if is_mesh and not lights.lights_meshes[l]:
@@ -86,7 +86,7 @@ def _light_weight(lights: LightArrays, l: int, p_x: float, p_y: float, p_z: floa
     return light_importance(lights, l, p_x, p_y, p_z)
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def sample_light_index(
     lights: LightArrays, p_x: float, p_y: float, p_z: float, u: float, is_mesh: bool
 ) -> tuple[int, float]:
@@ -113,7 +113,7 @@ def sample_light_index(
     return found, share
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def light_probability(lights: LightArrays, light_id: int, p_x: float, p_y: float, p_z: float) -> float:
     """Return the probability with which :func:`sample_light_index` asks a light at p, on a mesh."""
     total, own = 0.0, 0.0
@@ -125,7 +125,7 @@ def light_probability(lights: LightArrays, light_id: int, p_x: float, p_y: float
     return own / total if total > 0.0 else 0.0
 
 
-@njit_no_refcount()
+@njit_no_refcount(fastmath={"contract"})
 def no_shadow_probability(lights: LightArrays, p_x: float, p_y: float, p_z: float) -> float:
     """Return the probability with which a light is asked at p whose shadows take nothing."""
     if not lights.any_takes_nothing:
@@ -139,7 +139,7 @@ def no_shadow_probability(lights: LightArrays, p_x: float, p_y: float, p_z: floa
     return idle / total if total > 0.0 else 0.0
 
 
-@njit_no_refcount()
+@njit_no_refcount(fastmath={"contract"})
 def eval_emission(lights: LightArrays, l: int, u: float, v: float) -> tuple[float, float, float]:
     """Return linear radiance of a shining surface at texture coordinates."""
     rgb = lights.rgb_linear[l]
@@ -149,7 +149,7 @@ def eval_emission(lights: LightArrays, l: int, u: float, v: float) -> tuple[floa
     return rgb[0] * red, rgb[1] * green, rgb[2] * blue
 
 
-@njit_no_refcount()
+@njit_no_refcount(fastmath={"contract"})
 def emitter_hit_pdf(
     lights: LightArrays, l: int, o: Float32[np.ndarray, "3"], distance: float, cosine: float
 ) -> float:
@@ -170,14 +170,14 @@ def emitter_hit_pdf(
     return distance * distance / (max(cosine, 1e-9) * lights.areas[l])
 
 
-@njit_no_refcount()
+@njit_no_refcount(fastmath={"contract"})
 def _one_minus_cosine(squared_sine: float) -> float:
     """Return 1 - cos of an angle below 90 degrees, without cancellation where it is small."""
     squared_sine = min(squared_sine, 1.0)
     return max(squared_sine / (1.0 + math.sqrt(1.0 - squared_sine)), 1e-12)
 
 
-@njit_no_refcount()
+@njit_no_refcount(fastmath={"contract"})
 def _sample_sphere(
     lights: LightArrays, l: int, p_x: float, p_y: float, p_z: float, u: float, v: float
 ) -> tuple[float, float, float, float, float, float, float, float]:
@@ -190,7 +190,8 @@ def _sample_sphere(
     if squared <= of_ball:
         return 0.0, 0.0, 1.0, INFINITE_DISTANCE, 0.0, 0.0, 0.0, 1.0
     distance = math.sqrt(squared)
-    way_x, way_y, way_z = way_x / distance, way_y / distance, way_z / distance
+    inverse = 1.0 / distance
+    way_x, way_y, way_z = inverse * way_x, inverse * way_y, inverse * way_z
     cap = _one_minus_cosine(of_ball / squared)
     cosine = 1.0 - u * cap
     sine = math.sqrt(max(1.0 - cosine * cosine, 0.0))
@@ -211,7 +212,7 @@ def _sample_sphere(
     )
 
 
-@njit_no_refcount()
+@njit_no_refcount(fastmath={"contract"})
 def _sample_mesh(
     lights: LightArrays, l: int, p_x: float, p_y: float, p_z: float, u: float, v: float
 ) -> tuple[float, float, float, float, float, float, float, float]:
@@ -227,7 +228,8 @@ def _sample_mesh(
     way_z = a * corners[0, 2] + b * corners[1, 2] + c * corners[2, 2] - p_z
     squared = max(way_x * way_x + way_y * way_y + way_z * way_z, 1e-20)
     distance = math.sqrt(squared)
-    way_x, way_y, way_z = way_x / distance, way_y / distance, way_z / distance
+    inverse = 1.0 / distance
+    way_x, way_y, way_z = inverse * way_x, inverse * way_y, inverse * way_z
     s_x, s_y, s_z = (
         corners[1, 0] - corners[0, 0],
         corners[1, 1] - corners[0, 1],
@@ -251,7 +253,7 @@ def _sample_mesh(
     return way_x, way_y, way_z, distance, red, green, blue, squared / (cosine * lights.areas[l])
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def sample_light(
     lights: LightArrays, l: int, p_x: float, p_y: float, p_z: float, u: float, v: float
 ) -> tuple[float, float, float, float, float, float, float, float]:
@@ -282,7 +284,8 @@ def sample_light(
         way_z += a * lights.sides_u[l, 2] + b * lights.sides_v[l, 2]
     squared = max(way_x * way_x + way_y * way_y + way_z * way_z, 1e-20)
     distance = math.sqrt(squared)
-    way_x, way_y, way_z = way_x / distance, way_y / distance, way_z / distance
+    inverse = 1.0 / distance
+    way_x, way_y, way_z = inverse * way_x, inverse * way_y, inverse * way_z
     if kind == RECTANGLE:
         cosine = -(axis[0] * way_x + axis[1] * way_y + axis[2] * way_z)
         if cosine <= 1e-9:

@@ -234,12 +234,14 @@ class PathBlock(NamedTuple):
     """Memory in which one thread follows a block of paths.
 
     Attributes:
-        active: which paths are left.
+        paths: the paths.
+        active: which of them are left.
         hits: what they meet.
         shadows: what they ask of lights.
         transmittance: what meshes let through of it.
     """
 
+    paths: PathArrays
     active: Int32[np.ndarray, " b"]
     hits: MeshHits
     shadows: ShadowRayArrays

@@ -16,7 +16,7 @@ from octasplat.engine.pathtracing.kernels.scatter import FLAG_CAMERA_RAY, FLAG_S
 from octasplat.engine.trace.kernels.native import njit_no_refcount
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def eval_background(
     lights: LightArrays,
     environment: int,
@@ -33,7 +33,7 @@ def eval_background(
     return background[0], background[1], background[2]
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def add_radiance(paths: PathArrays, p: int, red: float, green: float, blue: float, clamp: float) -> None:
     """Add light to a path, no more than ``clamp`` of it where it comes by way of scattering."""
     if paths.flags[p] & FLAG_SCATTERED:
@@ -46,7 +46,7 @@ def add_radiance(paths: PathArrays, p: int, red: float, green: float, blue: floa
     paths.radiance_linear[p, 2] += blue
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def shade_miss(
     paths: PathArrays, p: int, lights: LightArrays, environment: int, integrator: IntegratorParameters
 ) -> None:
@@ -68,7 +68,7 @@ def shade_miss(
     add_radiance(paths, p, share * w[0] * red, share * w[1] * green, share * w[2] * blue, integrator.clamp)
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def shade_emitter(
     paths: PathArrays,
     p: int,
@@ -98,7 +98,7 @@ def shade_emitter(
     add_radiance(paths, p, share * w[0] * red, share * w[1] * green, share * w[2] * blue, integrator.clamp)
 
 
-@kernel(_nrt=False, error_model="numpy")
+@kernel(_nrt=False, error_model="numpy", fastmath={"contract"})
 def add_direct_light(
     first: int,
     last: int,

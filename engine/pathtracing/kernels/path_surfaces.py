@@ -17,7 +17,14 @@ from octasplat.engine.pathtracing.kernels.glass import (
     scatter_rough_glass,
     scatter_smooth_glass,
 )
-from octasplat.engine.pathtracing.kernels.kernel_args import AlbedoTables, Bsdf, MeshScene, SurfacePoint, Vec3
+from octasplat.engine.pathtracing.kernels.kernel_args import (
+    AlbedoTables,
+    Bsdf,
+    MeshScene,
+    SurfaceArrays,
+    SurfacePoint,
+    Vec3,
+)
 from octasplat.engine.pathtracing.kernels.nested_glass import copy_media
 from octasplat.engine.pathtracing.kernels.path_args import (
     BLOCK_SIZE,
@@ -32,9 +39,10 @@ from octasplat.engine.pathtracing.kernels.path_args import (
 )
 from octasplat.engine.pathtracing.kernels.path_radiance import shade_emitter, shade_miss
 from octasplat.engine.pathtracing.kernels.rough_dielectric import MIN_GLASS_ROUGHNESS
-from octasplat.engine.pathtracing.kernels.sampler import fill_pairs
+from octasplat.engine.pathtracing.kernels.sampler import fill_pair
 from octasplat.engine.pathtracing.kernels.scatter import (
     FLAG_CAMERA_RAY,
+    LIGHT_CHOICE_SAMPLE,
     LOBE_SAMPLE,
     sample_pair,
     scatter_path,
@@ -49,36 +57,61 @@ from octasplat.engine.pathtracing.kernels.surface import (
     eval_normal_map,
     eval_vertex_color,
     face_normal,
+    has_textures,
     interpolate_corners,
     interpolate_uv,
     offset_ray_origin,
     shading_normal,
 )
-from octasplat.engine.trace.kernels.native import njit_no_refcount
+from octasplat.engine.trace.kernels.native import njit_no_refcount, prefetch
+
+PREFETCH_ROWS = 16
+"""How far ahead of their use the rows of faces are asked for."""
+_LAST_WORD = 4 * 8
+"""Bytes before the last number of three corners."""
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def _fill_samples(
     scratch: PathScratch,
     paths: PathArrays,
     active: Int32[np.ndarray, " n"],
     faces: Int32[np.ndarray, " n"],
     first: int,
-    # of a block at a time: hashes of many paths are vectorized
     last: int,
     first_pair: int,
+    light_count: int,
 ) -> None:
-    """Fill in the numbers of those of the rows ``first`` to ``last``, at most a block, that meet a face."""
+    """Fill in the numbers of those of the rows ``first`` to ``last``, at most a block, that meet a face.
+
+    Where there is no choice of lights there are no numbers for it.
+    """
     count = 0
     for k in range(first, last):
         if faces[k] >= 0:
             p = active[k]
             scratch.keys[count], scratch.samples[count] = paths.keys[p], paths.samples[p]
             count += 1
-    fill_pairs(scratch.keys, scratch.samples, count, first_pair, scratch.random_numbers)
+    for pair in range(len(scratch.random_numbers)):
+        if pair != LIGHT_CHOICE_SAMPLE or light_count > 1:
+            fill_pair(
+                scratch.keys, scratch.samples, count, first_pair + pair, scratch.random_numbers[pair]
+            )  # fmt: skip
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
+def _prefetch_face(surfaces: SurfaceArrays, face: int) -> None:
+    """Ask for what is read of a face; a ray's face is rarely in a near cache."""
+    if face >= 0:
+        # three corners lie in one or two lines
+        corners, normals = surfaces.corners_world[face].ctypes.data, surfaces.corner_normals[face].ctypes.data
+        prefetch(corners)
+        prefetch(corners + _LAST_WORD)
+        prefetch(normals)
+        prefetch(normals + _LAST_WORD)
+
+
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def _write_denoiser_guides(
     paths: PathArrays, p: int, red: float, green: float, blue: float, n_x: float, n_y: float, n_z: float
 ) -> None:
@@ -92,7 +125,7 @@ def _write_denoiser_guides(
     paths.normals_world[p, 2] = share * n_z
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def _scatter_at_material(
     paths: PathArrays,
     p: int,
@@ -123,7 +156,7 @@ def _scatter_at_material(
         return
     # --- the material's numbers, textures looked up ---
     uv = surfaces.corner_uv[face]
-    u_t, v_t = interpolate_uv(uv, a, b, c)
+    u_t, v_t = interpolate_uv(uv, a, b, c) if has_textures(materials, m) else (0.0, 0.0)
     red, green, blue, metallic, roughness = eval_material(materials, m, u_t, v_t)
     if materials.uses_vertex_color[m]:
         t_r, t_g, t_b = eval_vertex_color(surfaces, face, a, b, c)
@@ -154,7 +187,7 @@ def _scatter_at_material(
     scatter_path(p, samples, paths, kind == DIFFUSE, off_surface, bsdf, tables, query)
 
 
-@kernel(_nrt=False, error_model="numpy")
+@kernel(_nrt=False, error_model="numpy", fastmath={"contract"})
 def shade_surfaces(first: int, last: int, scratch: PathScratch, bounce: Bounce) -> None:
     """Shade what paths find at the end of their rays.
 
@@ -167,8 +200,11 @@ def shade_surfaces(first: int, last: int, scratch: PathScratch, bounce: Bounce) 
     n = 0
     for k in range(first, last):
         if (k - first) % BLOCK_SIZE == 0:
-            _fill_samples(scratch, paths, active, hits.faces, k, min(k + BLOCK_SIZE, last), first_pair)
+            end = min(k + BLOCK_SIZE, last)
+            _fill_samples(scratch, paths, active, hits.faces, k, end, first_pair, len(lights.kinds))
             n = -1
+        if k + PREFETCH_ROWS < last:
+            _prefetch_face(surfaces, hits.faces[k + PREFETCH_ROWS])
         p, face = active[k], hits.faces[k]
         shadows.radiance_linear[k, 0] = shadows.radiance_linear[k, 1] = shadows.radiance_linear[k, 2] = 0.0
         if face == PATH_ENDED:

@@ -31,7 +31,7 @@ COUPLED, BURLEY = 0, 1
 CLEAR_COAT_IOR = 1.5
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def fresnel_dielectric(cos_o: float, eta: float) -> tuple[float, float]:
     """Return share of unpolarised light that a smooth surface reflects, and the cosine of the refracted ray.
 
@@ -47,14 +47,14 @@ def fresnel_dielectric(cos_o: float, eta: float) -> tuple[float, float]:
     return 0.5 * (parallel * parallel + across * across), cos_t
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def sample_cosine(u: float, v: float) -> tuple[float, float, float]:
     """Return a direction over the hemisphere, as dense as its cosine; its density is cosine / pi."""
     radius, angle = math.sqrt(u), 2.0 * math.pi * v
     return radius * math.cos(angle), radius * math.sin(angle), math.sqrt(max(1.0 - u, 0.0))
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def specular_probability(o_z: float, bsdf: Bsdf, coat_albedo: Float64[np.ndarray, "a c"]) -> float:
     """Return the probability with which a sample goes to the specular lobe rather than to the ground."""
     (red, green, blue), metallic, roughness = bsdf.rgb, bsdf.metallic, bsdf.roughness
@@ -68,7 +68,7 @@ def specular_probability(o_z: float, bsdf: Bsdf, coat_albedo: Float64[np.ndarray
     return min(max(specular / (specular + ground), 0.1), 0.9)  # neither lobe is left without samples
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def _base_eval(o: Vec3, i: Vec3, bsdf: Bsdf, tables: AlbedoTables) -> tuple[float, float, float, float]:
     """Return value times cosine (three channels) and density of the mixture of dielectric and metal."""
     o_x, o_y, o_z = o
@@ -78,8 +78,8 @@ def _base_eval(o: Vec3, i: Vec3, bsdf: Bsdf, tables: AlbedoTables) -> tuple[floa
         return 0.0, 0.0, 0.0, 0.0
     alpha = max(roughness * roughness, MIN_ALPHA)
     h_x, h_y, h_z = o_x + i_x, o_y + i_y, o_z + i_z
-    length = math.sqrt(h_x * h_x + h_y * h_y + h_z * h_z)
-    h_x, h_y, h_z = h_x / length, h_y / length, h_z / length
+    inverse = 1.0 / math.sqrt(h_x * h_x + h_y * h_y + h_z * h_z)
+    h_x, h_y, h_z = inverse * h_x, inverse * h_y, inverse * h_z
     cos_d = o_x * h_x + o_y * h_y + o_z * h_z
     masking_o, masking_i = ggx_masking(o_z, alpha), ggx_masking(i_z, alpha)
     density = ggx_density(h_z, alpha) / (4.0 * o_z)  # with the cosine to the light divided out
@@ -119,7 +119,7 @@ def _base_eval(o: Vec3, i: Vec3, bsdf: Bsdf, tables: AlbedoTables) -> tuple[floa
     return f_r, f_g, f_b, pdf
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def _base_sample(
     o: Vec3, bsdf: Bsdf, coat_albedo: Float64[np.ndarray, "a c"], choice: float, u: float, v: float
 ) -> Vec3:
@@ -130,7 +130,7 @@ def _base_sample(
     return _sample_reflection(o, max(bsdf.roughness * bsdf.roughness, MIN_ALPHA), u, v)
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def _sample_reflection(o: Vec3, alpha: float, u: float, v: float) -> Vec3:
     """Return o reflected at a visible facet."""
     o_x, o_y, o_z = o
@@ -139,7 +139,7 @@ def _sample_reflection(o: Vec3, alpha: float, u: float, v: float) -> Vec3:
     return twice * h_x - o_x, twice * h_y - o_y, twice * h_z - o_z
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def _clear_coat_shares(o_z: float, bsdf: Bsdf, tables: AlbedoTables) -> tuple[float, float]:
     """Return the share of light that the clear coat reflects, and the probability of a sample of it."""
     reflected = bsdf.clear_coat * table_value(tables.clear_coat_albedo, o_z, bsdf.clear_coat_roughness)
@@ -148,7 +148,7 @@ def _clear_coat_shares(o_z: float, bsdf: Bsdf, tables: AlbedoTables) -> tuple[fl
     return reflected, min(max(reflected / (reflected + below), 0.1), 0.9)
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def principled_eval(o: Vec3, i: Vec3, bsdf: Bsdf, tables: AlbedoTables) -> tuple[float, float, float, float]:
     """Return value times cosine (three channels) and density of the material with its clear coat."""
     f_r, f_g, f_b, pdf = _base_eval(o, i, bsdf, tables)
@@ -170,7 +170,7 @@ def principled_eval(o: Vec3, i: Vec3, bsdf: Bsdf, tables: AlbedoTables) -> tuple
     )  # fmt: skip
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def principled_sample(o: Vec3, bsdf: Bsdf, tables: AlbedoTables, choice: float, u: float, v: float) -> Vec3:
     """Draw a direction to the light, as dense as :func:`principled_eval` says; worth 0 below the surface."""
     if bsdf.clear_coat > 0.0:
@@ -182,7 +182,7 @@ def principled_sample(o: Vec3, bsdf: Bsdf, tables: AlbedoTables, choice: float, 
     return _base_sample(o, bsdf, tables.coat_albedo, choice, u, v)
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def orthonormal_basis(n_x: float, n_y: float, n_z: float) -> tuple[float, float, float, float, float, float]:
     """Return two unit vectors that complete the unit vector n to a right-handed frame.
 

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float64, Int32, Int64, UInt32
 
 from octasplat.engine.core.compilation import kernel
+from octasplat.engine.pathtracing.kernels.sampler_vectors import LANES, write_uniform_pairs8
 from octasplat.engine.trace.kernels.native import njit_no_refcount
 
 UINT32_TO_UNIT = 2.0**-32
@@ -107,22 +108,6 @@ def fill_uniform(
 
 
 @njit_no_refcount()
-def _fill_pair(
-    keys: UInt32[np.ndarray, " p"],
-    samples: Int32[np.ndarray, " p"],
-    count: int,
-    pair: int,
-    first: Float64[np.ndarray, " p"],
-    second: Float64[np.ndarray, " p"],
-) -> None:
-    """Write a pair of each path; without a branch, so that the compiler does many paths at a time."""
-    for k in range(count):
-        u, v = uniform_pair(keys[k], samples[k], pair)
-        first[k] = u
-        second[k] = v
-
-
-@njit_no_refcount()
 def fill_pairs(
     keys: UInt32[np.ndarray, " p"],
     samples: Int32[np.ndarray, " p"],
@@ -132,7 +117,23 @@ def fill_pairs(
 ) -> None:
     """Write :func:`uniform_pair` of ``count`` paths in the pairs of dimensions from ``first`` on.
 
-    ``out`` (pairs, 2, count or more) gets them.
+    Eight paths at a time: the rows have room for a multiple of eight, and hold anything behind ``count``.
     """
     for pair in range(len(out)):
-        _fill_pair(keys, samples, count, first + pair, out[pair, 0], out[pair, 1])
+        fill_pair(keys, samples, count, first + pair, out[pair])
+
+
+@njit_no_refcount()
+def fill_pair(
+    keys: UInt32[np.ndarray, " p"],
+    samples: Int32[np.ndarray, " p"],
+    count: int,
+    pair: int,
+    out: Float64[np.ndarray, "2 p"],
+) -> None:
+    """Write :func:`uniform_pair` of ``count`` paths in one pair of dimensions; see :func:`fill_pairs`."""
+    for k in range(0, count, LANES):
+        write_uniform_pairs8(
+            keys.ctypes.data + 4 * k, samples.ctypes.data + 4 * k, np.uint32(pair + 1),
+            out.ctypes.data + 8 * k, out.ctypes.data + 8 * (out.shape[1] + k),
+        )  # fmt: skip

@@ -48,7 +48,7 @@ LOBE_SAMPLE, DIRECTION_SAMPLE, LIGHT_CHOICE_SAMPLE, LIGHT_POSITION_SAMPLE, LAYER
 SHADOW_RAY_SCALE = 1.0 - 1e-4
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def spawn_ray(
     paths: PathArrays, p: int, x: float, y: float, z: float, d_x: float, d_y: float, d_z: float, pdf: float
 ) -> None:
@@ -64,7 +64,7 @@ def spawn_ray(
     paths.pdf[p] = pdf
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def queue_shadow_ray(
     shadows: ShadowRayArrays,
     k: int,
@@ -92,7 +92,7 @@ def queue_shadow_ray(
     shadows.t_max[k] = distance * SHADOW_RAY_SCALE if distance < INFINITE_DISTANCE else np.inf
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def sample_pair(samples: PathSamples, pair: int) -> tuple[float, float]:
     """Return a pair of uniform numbers of a path."""
     return samples.random_numbers[pair, 0, samples.n], samples.random_numbers[pair, 1, samples.n]
@@ -118,7 +118,7 @@ class LightSample(NamedTuple):
     pdf: float
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def draw_light(lights: LightArrays, point: Vec3, samples: PathSamples) -> LightSample:
     """Choose a light for a point, and a place on it."""
     x, y, z = point
@@ -131,7 +131,7 @@ def draw_light(lights: LightArrays, point: Vec3, samples: PathSamples) -> LightS
     return LightSample(-1, 0.0, (0.0, 0.0, 0.0), 0.0, (0.0, 0.0, 0.0), 0.0)
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def survives_roulette(paths: PathArrays, p: int, roulette: float) -> bool:
     """Play russian roulette: terminate a path by its throughput; returns whether it continues.
 
@@ -151,7 +151,7 @@ def survives_roulette(paths: PathArrays, p: int, roulette: float) -> bool:
     return True
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def surface_eval(
     o: Vec3, i: Vec3, is_diffuse: bool, bsdf: Bsdf, tables: AlbedoTables
 ) -> tuple[float, float, float, float]:
@@ -163,7 +163,7 @@ def surface_eval(
     return principled_eval(o, i, bsdf, tables)
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def scatter_path(
     p: int,
     samples: PathSamples,
@@ -211,10 +211,13 @@ def scatter_path(
     u, v = sample_pair(samples, DIRECTION_SAMPLE)
     if is_diffuse:
         i_x, i_y, i_z = sample_cosine(u, v)
+        (f_r, f_g, f_b), pdf = bsdf.rgb, i_z / math.pi  # as dense as the value: the color is what is left
     else:
         choice = sample_pair(samples, LOBE_SAMPLE)[0]
         i_x, i_y, i_z = principled_sample(o, bsdf, tables, choice, u, v)
-    f_r, f_g, f_b, pdf = surface_eval(o, (i_x, i_y, i_z), is_diffuse, bsdf, tables)
+        f_r, f_g, f_b, pdf = principled_eval(o, (i_x, i_y, i_z), bsdf, tables)
+        inverse = 1.0 / pdf if pdf > 0.0 else 0.0
+        f_r, f_g, f_b = inverse * f_r, inverse * f_g, inverse * f_b
     w_x = i_x * a_x + i_y * b_x + i_z * s_x
     w_y = i_x * a_y + i_y * b_y + i_z * s_y
     w_z = i_x * a_z + i_y * b_z + i_z * s_z
@@ -222,9 +225,10 @@ def scatter_path(
         paths.is_alive[p] = False
         return
     # --- the path goes on ---
-    paths.throughput[p, 0] *= f_r / pdf
-    paths.throughput[p, 1] *= f_g / pdf
-    paths.throughput[p, 2] *= f_b / pdf
+    paths.throughput[p, 0] *= f_r
+    paths.throughput[p, 1] *= f_g
+    paths.throughput[p, 2] *= f_b
     paths.flags[p] = (paths.flags[p] | FLAG_SCATTERED) & ~(FLAG_CLEAR | FLAG_CAMERA_RAY)
-    w_x, w_y, w_z = normalize(w_x, w_y, w_z)
+    if not is_diffuse:
+        w_x, w_y, w_z = normalize(w_x, w_y, w_z)
     spawn_ray(paths, p, x, y, z, w_x, w_y, w_z, pdf)

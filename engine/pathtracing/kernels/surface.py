@@ -13,7 +13,7 @@ DIFFUSE, MIRROR, GLASS, PRINCIPLED, EMITTER = 0, 1, 2, 3, 4
 RAY_OFFSET_SCALE = 5e-6
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def interpolate_corners(
     corners: Float32[np.ndarray, "3 3"], a: float, b: float, c: float
 ) -> tuple[float, float, float]:
@@ -25,7 +25,7 @@ def interpolate_corners(
     )
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def interpolate_uv(
     corner_uv: Float32[np.ndarray, "3 2"], a: float, b: float, c: float
 ) -> tuple[float, float]:
@@ -36,14 +36,14 @@ def interpolate_uv(
     )
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def normalize(x: float, y: float, z: float) -> tuple[float, float, float]:
     """Return the vector with length 1."""
-    length = max(math.sqrt(x * x + y * y + z * z), 1e-30)
-    return x / length, y / length, z / length
+    inverse = 1.0 / max(math.sqrt(x * x + y * y + z * z), 1e-30)
+    return inverse * x, inverse * y, inverse * z
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def face_normal(corners: Float32[np.ndarray, "3 3"]) -> tuple[float, float, float]:
     """Return unit normal of a triangle, on the side from which its corners run anticlockwise."""
     u_x, u_y, u_z = (
@@ -59,7 +59,7 @@ def face_normal(corners: Float32[np.ndarray, "3 3"]) -> tuple[float, float, floa
     return normalize(u_y * v_z - u_z * v_y, u_z * v_x - u_x * v_z, u_x * v_y - u_y * v_x)
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def offset_ray_origin(
     p_x: float, p_y: float, p_z: float, n_x: float, n_y: float, n_z: float
 ) -> tuple[float, float, float]:
@@ -69,7 +69,17 @@ def offset_ray_origin(
     return p_x + step * n_x, p_y + step * n_y, p_z + step * n_z
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
+def has_textures(materials: MaterialArrays, m: int) -> bool:
+    """Return whether :func:`eval_material` or :func:`eval_normal_map` reads a texture."""
+    return (
+        materials.color_textures[m] >= 0
+        or materials.metallic_roughness_textures[m] >= 0
+        or materials.normal_textures[m] >= 0
+    )
+
+
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def eval_material(
     materials: MaterialArrays, m: int, u: float, v: float
 ) -> tuple[float, float, float, float, float]:
@@ -92,7 +102,7 @@ def eval_material(
     return red, green, blue, metallic, roughness
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def eval_vertex_color(
     surfaces: SurfaceArrays, face: int, a: float, b: float, c: float
 ) -> tuple[float, float, float]:
@@ -102,7 +112,7 @@ def eval_vertex_color(
     return interpolate_corners(surfaces.corner_rgb_linear[face], a, b, c)
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def eval_normal_map(
     materials: MaterialArrays,
     m: int,
@@ -165,7 +175,7 @@ def eval_normal_map(
     return x, y, z
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def shading_normal(
     normals: Float32[np.ndarray, "3 3"],
     a: float,
@@ -188,7 +198,7 @@ def shading_normal(
     return s_x, s_y, s_z
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def reflect(
     d_x: float, d_y: float, d_z: float, n_x: float, n_y: float, n_z: float
 ) -> tuple[float, float, float]:

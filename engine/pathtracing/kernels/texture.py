@@ -6,7 +6,7 @@ from octasplat.engine.pathtracing.kernels.kernel_args import LightArrays, Materi
 from octasplat.engine.trace.kernels.native import njit_no_refcount
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def eval_texture(
     materials: LightArrays | MaterialArrays, texture: int, u: float, v: float
 ) -> tuple[float, float, float]:

@@ -6,11 +6,11 @@ from jaxtyping import Float32
 from octasplat.engine.core.compilation import kernel
 from octasplat.engine.pathtracing.kernels.camera_paths import start_paths
 from octasplat.engine.pathtracing.kernels.cutouts import pass_surfaces
+from octasplat.engine.pathtracing.kernels.film import FilmArrays, add_paths
 from octasplat.engine.pathtracing.kernels.kernel_args import IntegratorParameters, MeshQueries, MeshScene
 from octasplat.engine.pathtracing.kernels.path_args import (
     BLOCK_SIZE,
     Bounce,
-    PathArrays,
     PathBlock,
     PathScratch,
     PathStart,
@@ -31,17 +31,26 @@ def trace_paths(
     queries: MeshQueries,
     t_min: Float32[np.ndarray, "1"],
     t_max: Float32[np.ndarray, "1"],
-    paths: PathArrays,
     block: PathBlock,
+    film: FilmArrays,
+    without_meshes: FilmArrays,
 ) -> None:
-    """Start and end ``count`` paths; the camera sees nothing nearer than ``t_min``, ``t_max`` is infinite."""
-    active, hits, shadows, transmittance = block.active, block.hits, block.shadows, block.transmittance
-    for begin in range(0, count, BLOCK_SIZE):
-        end = min(begin + BLOCK_SIZE, count)
-        start_paths(begin, end, scratch, integrator, start, paths)
-        left = end - begin
+    """Start and end the paths of ``count`` pixels, and add them to a film.
+
+    The camera sees nothing nearer than ``t_min``; ``t_max`` is infinite. A block has room for all paths that
+    a pixel starts at a time.
+    """
+    paths, active, hits, shadows, transmittance = block
+    each = start.paths_per_pixel
+    together = BLOCK_SIZE // each
+    for begin in range(0, count, together):
+        pixels = min(together, count - begin)
+        left = pixels * each
+        first = start.first_pixel + begin
+        part = PathStart(start.camera_rays, start.pixel_order, first, each, start.first_sample)
+        start_paths(0, left, scratch, integrator, part, paths)
         for k in range(left):
-            active[k] = begin + k
+            active[k] = k
         for depth in range(integrator.max_depth + 1):
             # --- what the rays meet ---
             # only the camera has a near limit
@@ -70,3 +79,4 @@ def trace_paths(
             left = going
             if left == 0:
                 break
+        add_paths(pixels, paths, each, start.pixel_order, first, film, without_meshes)

@@ -13,14 +13,14 @@ from jaxtyping import Float64
 from octasplat.engine.trace.kernels.native import njit_no_refcount
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def schlick_weight(cosine: float) -> float:
     """(1 - cosine) to the power of 5."""
     x = min(max(1.0 - cosine, 0.0), 1.0)
     return x * x * x * x * x
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def ggx_density(cos_h: float, alpha: float) -> float:
     """Return the microfacet distribution D at a half vector of that cosine."""
     a2 = alpha * alpha
@@ -28,14 +28,14 @@ def ggx_density(cos_h: float, alpha: float) -> float:
     return a2 / (math.pi * x * x)
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def ggx_masking(cosine: float, alpha: float) -> float:
     """Smith's G1: the share of the facets that face a direction and are seen from it."""
     c2 = cosine * cosine
     return 2.0 / (1.0 + math.sqrt(1.0 + alpha * alpha * max(1.0 - c2, 0.0) / max(c2, 1e-12)))
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def sample_visible_normal(
     o_x: float, o_y: float, o_z: float, alpha: float, u: float, v: float
 ) -> tuple[float, float, float]:
@@ -54,7 +54,7 @@ def sample_visible_normal(
     return h_x / length, h_y / length, h_z / length
 
 
-@njit_no_refcount(forceinline=True)
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def table_value(table: Float64[np.ndarray, "a c"], cosine: float, roughness: float) -> float:
     """Return bilinear value of a table over (roughness, cosine), both from 0 to 1."""
     rows, columns = table.shape

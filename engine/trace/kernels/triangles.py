@@ -52,15 +52,31 @@ class TriangleHitArrays(NamedTuple):
 
 
 @njit_no_refcount()
+def _prepare_queries(is_coherent: bool, scratch: Float32[np.ndarray, " w"]) -> None:
+    """Write what all calls of Embree have in common and leave as it is."""
+    words = scratch.view(np.int32)
+    for lane in range(LANES):
+        scratch[TIME * LANES + lane] = np.float32(0.0)
+        words[MASK * LANES + lane] = -1
+        words[ID * LANES + lane] = 0
+        words[FLAGS * LANES + lane] = 0
+        words[INSTANCE * LANES + lane] = INVALID_ID
+    # --- RTCIntersectArguments ---
+    words[ARGUMENTS * LANES] = RTC_RAY_QUERY_FLAG_COHERENT if is_coherent else 0
+    words[ARGUMENTS * LANES + 1] = RTC_FEATURE_FLAG_ALL
+    for word in range(2, 8):
+        words[ARGUMENTS * LANES + word] = 0
+
+
+@njit_no_refcount()
 def _query_rays8(
     query: EmbreeQuery,
     rays: TriangleRays,
     row: int,
     end: int,
-    is_coherent: bool,
     scratch: Float32[np.ndarray, " w"],
 ) -> None:
-    """Trace up to eight rays, from ``row`` on and before ``end``."""
+    """Trace up to eight rays, from ``row`` on and before ``end``, after :func:`_prepare_queries`."""
     words = scratch.view(np.int32)
     # --- the rays, a lane each ---
     for lane in range(LANES):
@@ -74,19 +90,9 @@ def _query_rays8(
         far = rays.t_max[r if len(rays.t_max) > 1 else 0]
         scratch[T_NEAR * LANES + lane] = near
         scratch[T_FAR * LANES + lane] = far
-        scratch[TIME * LANES + lane] = np.float32(0.0)
-        words[MASK * LANES + lane] = -1
-        words[ID * LANES + lane] = 0
-        words[FLAGS * LANES + lane] = 0
-        words[FACE * LANES + lane] = INVALID_ID
-        words[GEOMETRY * LANES + lane] = INVALID_ID
-        words[INSTANCE * LANES + lane] = INVALID_ID
         words[VALID * LANES + lane] = -1 if row + lane < end and near <= far else 0
-    # --- RTCIntersectArguments ---
-    words[ARGUMENTS * LANES] = RTC_RAY_QUERY_FLAG_COHERENT if is_coherent else 0
-    words[ARGUMENTS * LANES + 1] = RTC_FEATURE_FLAG_ALL
-    for word in range(2, 8):
-        words[ARGUMENTS * LANES + word] = 0
+    for lane in range(LANES):  # only a hit has a face and an instance
+        words[GEOMETRY * LANES + lane] = INVALID_ID
     address = scratch.ctypes.data
     call_with_four_pointers(
         query.function, address + 4 * VALID * LANES, query.scene, address, address + 4 * ARGUMENTS * LANES
@@ -109,12 +115,12 @@ def closest_hits(
     :data:`SCRATCH_ROWS` rows of 8 words, which begin on a cache line.
     """
     words = scratch.view(np.int32)
+    _prepare_queries(is_coherent, scratch)
     for k in range(first, last, LANES):
-        _query_rays8(query, rays, k, last, is_coherent, scratch)
+        _query_rays8(query, rays, k, last, scratch)
         for lane in range(min(LANES, last - k)):
-            face = words[FACE * LANES + lane]
-            hit = face != INVALID_ID
-            out.faces[k + lane] = face
+            hit = words[GEOMETRY * LANES + lane] != INVALID_ID
+            out.faces[k + lane] = words[FACE * LANES + lane] if hit else -1
             out.distances[k + lane] = scratch[T_FAR * LANES + lane] if hit else np.float32(np.inf)
             out.barycentrics[k + lane, 0] = scratch[U * LANES + lane] if hit else np.float32(0.0)
             out.barycentrics[k + lane, 1] = scratch[V * LANES + lane] if hit else np.float32(0.0)
@@ -130,8 +136,9 @@ def any_hits(
     occluded: Bool[np.ndarray, " q"],
 ) -> None:
     """Find whether any triangle lies on each of the rays of rows ``first`` to ``last``."""
+    _prepare_queries(False, scratch)
     for k in range(first, last, LANES):
-        _query_rays8(query, rays, k, last, False, scratch)
+        _query_rays8(query, rays, k, last, scratch)
         for lane in range(min(LANES, last - k)):
             occluded[k + lane] = scratch[T_FAR * LANES + lane] == -np.inf  # Embree's sign for a hit
 
