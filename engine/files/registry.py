@@ -108,6 +108,7 @@ class SurfaceWriter(Entry):
         write: writes the surface and returns every file written, the path itself first.
         textured: whether it can hold a texture.
         lit: whether it can hold materials.
+        missing_requirement: see :class:`Exporter`.
         beside: names the files that are written beside the path for a texture, if there are any.
     """
 
@@ -115,6 +116,7 @@ class SurfaceWriter(Entry):
     write: Callable[[TriangleMesh, Path], tuple[Path, ...]]
     textured: bool
     lit: bool = False
+    missing_requirement: Callable[[], str | None] = lambda: None
     beside: Callable[[Path], tuple[Path, ...]] = no_files
 
 

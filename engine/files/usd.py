@@ -5,8 +5,6 @@ axis; the scale along it has no meaning and is the flat 1e-5. The data are turne
 usd-core (the extra ``usd``).
 """
 
-import importlib.metadata
-import importlib.util
 import tempfile
 from pathlib import Path
 from types import ModuleType
@@ -16,22 +14,20 @@ import numpy as np
 
 from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.core.errors import SceneFileError
-from octasplat.engine.core.georeference import Georeference
-from octasplat.engine.core.local_origin import Origin, is_set
+from octasplat.engine.core.local_origin import is_set
 from octasplat.engine.core.writing import atomic_replace
 from octasplat.engine.files.encodings import half_turn_gaussians, unit_quats
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.registry import Exporter, register
 from octasplat.engine.files.splat_rows import check_scales, select_for_export
+from octasplat.engine.files.usd_stage import ROOT, import_usd, missing_usd, place_in_georeference
 from octasplat.engine.gaussians.flattening import rotate_axis_to_first
 from octasplat.engine.gaussians.model import FLAT_SCALE, FlatGaussians
 from octasplat.engine.gaussians.scene_metadata import SceneMetadata
 
-ROOT, FIELD = "/octasplat", "/octasplat/gaussians"
+FIELD = f"{ROOT}/gaussians"
 COLOR_SPACE = "srgb_rec709_scene"
 EXTENT_SIGMAS = 3.0
-EAST_UP_SOUTH = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""From x east, y north and z up to y up."""
 SCHEMAS = (
     "ParticleFieldPositionAttributeAPI",
     "ParticleFieldOrientationAttributeAPI",
@@ -65,37 +61,11 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     return (path,)
 
 
-def missing_usd() -> str | None:
-    """Return what is missing to write USD, without loading it.
-
-    Whether an old copy will do shows when it is used.
-    """
-    if importlib.util.find_spec("pxr") is None:
-        return "needs the package usd-core; install it with pip install 'usd-core>=26.5'"
-    try:
-        version = importlib.metadata.version("usd-core")
-    except importlib.metadata.PackageNotFoundError:  # USD of another package
-        return None
-    numbers = tuple(int(part) for part in version.split(".")[:2] if part.isdigit())
-    return None if numbers >= (26, 5) else f"usd-core {version} is too old; install usd-core 26.5 or later"
-
-
 def _import_usd(path: Path) -> dict[str, ModuleType]:
-    try:
-        from pxr import Gf, Sdf, Usd, UsdGeom, UsdUtils, UsdVol, Vt
-    except ImportError as error:
-        raise SceneFileError(f"{path}: {missing_usd() or error}.") from error
-    if not hasattr(UsdVol, "ParticleField"):
+    pxr = import_usd(path, ("Gf", "Sdf", "Usd", "UsdGeom", "UsdUtils", "UsdVol", "Vt"))
+    if not hasattr(pxr["UsdVol"], "ParticleField"):
         raise SceneFileError(f"{path}: this usd-core has no ParticleField; install usd-core 26.5 or later.")
-    return {
-        "Gf": Gf,
-        "Sdf": Sdf,
-        "Usd": Usd,
-        "UsdGeom": UsdGeom,
-        "UsdUtils": UsdUtils,
-        "UsdVol": UsdVol,
-        "Vt": Vt,
-    }
+    return pxr
 
 
 def _write_stage(pxr: dict[str, ModuleType], scene: FlatGaussians, layer: Path, facts: SceneMetadata) -> None:
@@ -104,7 +74,9 @@ def _write_stage(pxr: dict[str, ModuleType], scene: FlatGaussians, layer: Path, 
     geom.SetStageUpAxis(stage, geom.Tokens.y)
     root = geom.Xform.Define(stage, ROOT)
     if facts.georeference is not None:
-        _place_in_georeference(pxr, stage, root, facts.georeference, facts.origin_world)
+        place_in_georeference(
+            pxr, stage, root, facts.georeference, facts.origin_world, np.diag([1.0, -1.0, -1.0, 1.0])
+        )
     else:
         geom.SetStageMetersPerUnit(stage, 1.0)
         if is_set(facts.origin_world):
@@ -145,29 +117,6 @@ def _write_stage(pxr: dict[str, ModuleType], scene: FlatGaussians, layer: Path, 
         primvar.Set(vt.FloatArray.FromNumpy(np.ascontiguousarray(values).reshape(-1)))
     prim.GetAttribute("primvars:displayColor").SetColorSpace("lin_rec709_scene")
     stage.GetRootLayer().Save()
-
-
-def _place_in_georeference(
-    pxr: dict[str, ModuleType], stage: Any, root: Any, georeference: Georeference, origin: Origin
-) -> None:
-    """Put the root where it lies about the anchor, x east, y up and z south, in units of the scene.
-
-    How many metres a unit is, and where the anchor is, stand in the metadata of the stage.
-    """
-    scale = georeference.metres_per_unit
-    pxr["UsdGeom"].SetStageMetersPerUnit(stage, scale)
-    shift, data = np.eye(4), np.diag([1.0, -1.0, -1.0, 1.0])
-    shift[:3, 3] = origin
-    placed = georeference.metres_from_scene @ shift @ data  # of the data, which are turned by half about x
-    placed[:3] /= scale
-    placed = EAST_UP_SOUTH @ placed
-    # USD multiplies row vectors
-    root.AddTransformOp(pxr["UsdGeom"].XformOp.PrecisionDouble).Set(pxr["Gf"].Matrix4d(*placed.T.ravel()))
-    known: dict[str, object] = {"axes": "x east, y up, z south, in units of metersPerUnit"}
-    if georeference.anchor is not None:
-        known |= {"crs": georeference.crs, "anchor": pxr["Gf"].Vec3d(*georeference.anchor)}
-    layer = stage.GetRootLayer()
-    layer.customLayerData = {"octasplat_georeference": known}
 
 
 register(

@@ -91,13 +91,23 @@ def _format_list_text(names: Sequence[str], one: str, several: str) -> str:
     return f"The formats {', '.join(names[:-1])} and {names[-1]} {several}"
 
 
-def check_surface_path(path: Path, *, textured: bool, lit: bool = False) -> None:
+def check_surface_path(
+    path: Path, *, textured: bool, lit: bool = False, is_written_here: bool = True
+) -> None:
     """Refuse names that no writer takes, before the long work.
 
+    Args:
+        path: of the surface.
+        textured: whether it has a texture.
+        lit: whether it has materials.
+        is_written_here: whether what the format needs is to be installed on this machine.
+
     Raises:
-        ConfigError: the suffix is unknown, or cannot hold a texture or materials.
+        ConfigError: the suffix is unknown, or cannot hold a texture or materials, or needs what is missing.
     """
-    _surface_writer(path, textured, lit)
+    writer = _surface_writer(path, textured, lit)
+    if is_written_here and (lacking := writer.missing_requirement()) is not None:
+        raise ConfigError(f"{path}: {lacking}.")
 
 
 def surface_files(path: Path, *, textured: bool) -> tuple[Path, ...]:
@@ -111,12 +121,13 @@ def surface_files(path: Path, *, textured: bool) -> tuple[Path, ...]:
 
 
 def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
-    """Write ``mesh`` as GLB, PLY or OBJ, as its suffix says, and return every file written, ``path`` first.
+    """Write ``mesh`` as its suffix says, and return every file written, ``path`` first.
 
     GLB: unlit, the colors being those of the photographs with their light; normals are there for who wants
     to light it anew. Its root node turns COLMAP's frame to glTF's. With materials it is lit, and the node
-    turns the light's up to glTF's. PLY and OBJ keep the world frame. OBJ
-    with vertex colors writes them behind the positions; with a texture, an MTL and a PNG lie beside it.
+    turns the light's up to glTF's. USDZ likewise, but a georeference says its place and its metres. PLY and
+    OBJ keep the world frame. OBJ with vertex colors writes them behind the positions; with a texture, an MTL
+    and a PNG lie beside it.
 
     Raises:
         ConfigError: the suffix does not fit.
@@ -134,7 +145,11 @@ def _surface_writer(path: Path, textured: bool, lit: bool) -> SurfaceWriter:
     if writer is None:
         raise ConfigError(f"{path}: a surface is written as {surface_suffixes()}; name one of these.")
     if lit and not writer.lit:
-        raise ConfigError(f"{path}: materials are written as .glb; name one, or leave the materials out.")
+        raise ConfigError(
+            f"{path}: materials are written as .glb or .usdz; name one, or leave the materials out."
+        )
     if textured and not writer.textured:
-        raise ConfigError(f"{path}: a PLY holds no texture; name a .glb or .obj, or leave the texture out.")
+        raise ConfigError(
+            f"{path}: a PLY holds no texture; name a .glb, .obj or .usdz, or leave the texture out."
+        )
     return writer

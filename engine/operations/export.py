@@ -252,14 +252,14 @@ class _ExportPreparation:
     def prepare(self, exporter: Exporter) -> "tuple[FlatGaussians, ExportOptions]":
         """Return the scene and the options for a format."""
         from octasplat.engine.files.mesh_glb import VIEWER_FORMAT
-        from octasplat.engine.files.surface_export import SURFACE_FORMAT
+        from octasplat.engine.files.surface_export import SURFACE_FORMATS
         from octasplat.engine.runs.viewer_glb import prepare_for_viewers, upright_turn
 
         request, options = self._request, self._export_options
         is_glb = exporter.name == "glb"
-        if exporter.name == SURFACE_FORMAT:
+        if exporter.name in SURFACE_FORMATS:
             return self._gaussians, options.model_copy(
-                update={"surface": self._surface, "turn_xyzw": upright_turn(request.source)}
+                update={"surface": lambda: self._surface, "turn_xyzw": upright_turn(request.source)}
             )
         # formats of one color a Gaussian get the color that loses least
         if not (exporter.holds_harmonics or (request.materials and is_glb)):
@@ -270,6 +270,7 @@ class _ExportPreparation:
             return prepare_for_viewers(gaussians, request.source, options, request.extent)
         return gaussians, options if is_glb else options.model_copy(update={"light_up": None})
 
+    @cached_property
     def _surface(self) -> "TriangleMesh":
         from octasplat.engine.runs.small_surface import small_surface
 

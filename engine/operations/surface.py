@@ -98,8 +98,8 @@ class SurfaceOptions(ExtractionOptions, Options):
     )
     materials: bool = Field(
         False,
-        description="Base color, metallic, roughness and normals in textures, to be lit; .glb. Takes 60,000 "
-        "triangles and a texture of 1,024 pixels where nothing else is said.",
+        description="Base color, metallic, roughness and normals in textures, to be lit; .glb or .usdz. "
+        "Takes 60,000 triangles and a texture of 1,024 pixels where nothing else is said.",
     )
     up: Axis | None = Field(
         None, description="With materials: the axis that points up.  [default: the run's, of a file -y]"
@@ -139,7 +139,7 @@ class SurfaceRequest(SurfaceOptions, WritingRequest):
     """
 
     source: Source = Field(description="The scene to mesh: the folder of a run, or a file of any format.")
-    output: Output = Field(description="A .glb, .ply or .obj file.")
+    output: Output = Field(description="A .glb, .ply, .obj or .usdz file.")
     dataset: DatasetFolder = Field(
         None,
         description="Take the cameras of the photographs in this folder, and of a run the colors.  "

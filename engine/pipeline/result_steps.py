@@ -9,7 +9,7 @@ from octasplat.engine.files.export_batch import export_batch, targets_with_known
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
 from octasplat.engine.files.mesh_glb import VIEWER_FORMAT
 from octasplat.engine.files.registry import Exporter
-from octasplat.engine.files.surface_export import SURFACE_FORMAT
+from octasplat.engine.files.surface_export import SURFACE_FORMATS
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.pipeline.run import ReconstructionRun
 from octasplat.engine.runs.baked_scene import BakedScene
@@ -68,7 +68,7 @@ def _export(run: ReconstructionRun, names: list[str]) -> str | None:
     options = ExportOptions(q=run.config.train.trace.q, facts=read_metadata(output))
 
     formats = {name: exporter_for(output / name) for name in names}
-    surfaces = [name for name, exporter in formats.items() if exporter.name == SURFACE_FORMAT]
+    surfaces = [name for name, exporter in formats.items() if exporter.name in SURFACE_FORMATS]
     needs_colors = any(
         not exporter.holds_harmonics for name, exporter in formats.items() if name not in surfaces
     )
@@ -110,7 +110,7 @@ def _export(run: ReconstructionRun, names: list[str]) -> str | None:
         progress(Warned(lost))
 
     def prepare(exporter: Exporter) -> tuple[FlatGaussians, ExportOptions]:
-        if exporter.name == SURFACE_FORMAT:
+        if exporter.name in SURFACE_FORMATS:
             return gaussians, options.model_copy(
                 update={"surface": lambda: surface, "turn_xyzw": upright_turn(output)}
             )

@@ -24,6 +24,7 @@ DEFAULT_FILE_NAMES = {
     "splat": "scene.splat",
     "khr-glb": "scene.splats.glb",
     "usd": "scene.usdz",
+    "surface-usdz": "surface.usdz",
 }
 """A file name by format."""
 _LABELS = {

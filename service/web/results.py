@@ -233,6 +233,10 @@ _USE_BY_NAME = {
     **{name: (_SCENE, file.opens_in) for file in RESULT_FILES for name in file.names},
     "octagons_alpha.png": (_SCENE, "the texture that octagons.obj uses"),
     "mesh_alpha.png": (_SCENE, "the texture that mesh.obj uses"),
+    "surface.usdz": (
+        _SCENE,
+        "iPhone and iPad (AR Quick Look), Blender, USD viewers: one mesh of opaque triangles",
+    ),
     "lod-meta.json": (_SCENE, "the PlayCanvas engine, with the folders of its chunks"),
     "tileset.json": (_SCENE, "CesiumJS, with the folder of its tiles"),
     METRICS: (_FIGURES, "any program that reads JSON"),

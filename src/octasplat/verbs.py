@@ -706,7 +706,7 @@ def surface(
 
     Args:
         source: The scene to mesh: the folder of a run, or a file of any format.
-        output: A .glb, .ply or .obj file.
+        output: A .glb, .ply, .obj or .usdz file.
         overwrite: Replace files that are there already, too, which are not of an earlier run of this
             command or were changed since. What is read is never replaced.
         unbounded: Reach to the horizon, with ever coarser voxels, instead of meshing a box.
@@ -739,8 +739,8 @@ def surface(
             backdrop, settle and finer voxels.
         max_triangles: Decimate to so many triangles, such as 60000 or 60k; 5k,50k,500k writes a file
             each, NAME_5k.glb. [default: all]
-        materials: Base color, metallic, roughness and normals in textures, to be lit; .glb. Takes
-            60,000 triangles and a texture of 1,024 pixels where nothing else is said.
+        materials: Base color, metallic, roughness and normals in textures, to be lit; .glb or .usdz.
+            Takes 60,000 triangles and a texture of 1,024 pixels where nothing else is said.
         up: With materials: the axis that points up. [default: the run's, of a file -y]
         dataset: Take the cameras of the photographs in this folder, and of a run the colors. [default:
             the cameras that a run keeps; else none]

@@ -73,7 +73,7 @@ def test_surface_of_file_uses_surrounding_cameras(run, octasplat, tmp_path):
 @pytest.mark.parametrize(
     ("options", "complaint"),
     [
-        (("-o", "a.stl"), "written as .glb, .ply or .obj"),
+        (("-o", "a.stl"), "written as .glb, .ply, .obj or .usdz"),
         (("-o", "a.ply", "--texture-size", 128), "holds no texture"),
         (("-o", "a.glb", "--unbounded", "--bounds", "0,0,0,1,1,1"), "contradict"),
         (("-o", "a.glb", "--bounds", "0,0,0,1,1,0"), "x0 < x1"),

@@ -22,15 +22,18 @@ _PRESET_OPTIONS = ("room", "materials")
 class SurfaceJobOptions(SurfaceOptions):
     """Options of ``surface``: how the surface is meshed and colored, and in which format."""
 
-    format: Literal["glb", "ply", "obj"] = Field(
-        "glb", description="Format of the mesh, which is surface.glb, .ply or .obj among the results."
+    format: Literal["glb", "ply", "obj", "usdz"] = Field(
+        "glb", description="Format of the mesh, which is surface.glb, .ply, .obj or .usdz among the results."
     )
 
     @model_validator(mode="after")
     def _check_format(self) -> "SurfaceJobOptions":
         try:
             check_surface_path(
-                Path(f"surface.{self.format}"), textured=self.texture_size is not None, lit=self.materials
+                Path(f"surface.{self.format}"),
+                textured=self.texture_size is not None,
+                lit=self.materials,
+                is_written_here=False,
             )
         except ConfigError as error:
             raise ValueError(str(error).removesuffix(".")) from None
