@@ -7,14 +7,13 @@ import numpy as np
 from jaxtyping import Float64
 
 from octasplat.engine.blocks.partition import Box, cut_into_boxes, weighted_spread
+from octasplat.engine.blocks.piece_settings import MARGIN
 from octasplat.engine.blocks.pixel_selection import seen_pixels, select_pixels
 from octasplat.engine.dataset.view_tiles import Rectangles
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.trace.protocol import Tracer
 from octasplat.engine.train.sampling.pixel_sampler import TrainingData
 
-MARGIN = 0.1
-"""Margin around a block's core that is trained with it, of the distance over which what is seen spreads."""
 MIN_VIEWS = 4
 """A block that fewer views show keeps the coarse Gaussians."""
 

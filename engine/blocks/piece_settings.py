@@ -5,11 +5,15 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.train.config import McmcConfig, TrainConfig, uses_shared_sort
+from octasplat.engine.train.config import McmcConfig, TrainConfig, max_gaussian_count, uses_shared_sort
 
 if TYPE_CHECKING:
     from octasplat.engine.runs.config import ReconstructionConfig
 
+AUTO_VIEWS = 500
+"""Most training views of each block, on average, where the number of blocks is automatic."""
+MARGIN = 0.1
+"""Margin around a block's core that is trained with it, of the distance over which what is seen spreads."""
 COARSE_ITERATIONS, COARSE_GAUSSIANS = 2_500, 50_000
 """Most of the coarse scene, as of the preset fast."""
 COARSE_ITERATION_FRACTION, COARSE_GAUSSIAN_FRACTION = 1 / 2, 1 / 4
@@ -32,6 +36,32 @@ FINISH_FRACTION = 1 / 3
 """Iterations of finishing all blocks together, of those of the blocks."""
 FINISH_AVERAGING_START = 0.5
 """Share of them after which states are averaged."""
+
+
+def fewest_blocks(
+    config: TrainConfig,
+    views: int,
+    training_pixels: int,
+    most_gaussians: int | None,
+    valid_fraction: float = 1.0,
+) -> int:
+    """Return the fewest blocks for so many training views and pixels of them.
+
+    Args:
+        config: settings of the training.
+        views: number of training views.
+        training_pixels: of all of them.
+        most_gaussians: of any block with its margin; None for no such limit.
+        valid_fraction: share of the pixels that shows anything.
+    """
+    by_views = math.ceil(views / AUTO_VIEWS)
+    if most_gaussians is None:
+        return by_views
+    wanted = max_gaussian_count(config, training_pixels, valid_fraction)
+    if wanted <= most_gaussians:
+        return by_views
+    # blocks overlap by their margins
+    return max(by_views, math.ceil(wanted * (1 + 2 * MARGIN) / most_gaussians))
 
 
 def require_blocks_possible(config: "ReconstructionConfig") -> None:

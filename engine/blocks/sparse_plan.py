@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from octasplat.engine.blocks.block_plan import MARGIN
 from octasplat.engine.blocks.partition import Box, cut_into_boxes, weighted_spread
+from octasplat.engine.blocks.piece_settings import MARGIN
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.dataset.model import DatasetModel
 from octasplat.engine.dataset.view_tiles import ViewTiles

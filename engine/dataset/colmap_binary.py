@@ -72,7 +72,7 @@ def read_binary_model(folder: Path) -> ModelRecords:
 
 def read_binary_observations(path: Path) -> dict[int, Observations]:
     """Return the observations of points in a whole ``images.bin``, by the ids of their images."""
-    data, found = path.read_bytes(), {}
+    data, found = _memory_map(path), {}
     for position, _, values in _image_records(data):
         shown = values[values["point"] != _NO_POINT]
         (image_id,) = _unpack("I", data, position)
@@ -103,12 +103,12 @@ def _read_cameras(data: bytes, path: Path) -> Iterator[tuple[int, CameraRecord]]
         yield camera_id, CameraRecord(camera_id, names[model], width, height, params)
 
 
-def _image_records(data: bytes) -> Iterator[tuple[int, int, Any]]:
+def _image_records(data: Any) -> Iterator[tuple[int, int, Any]]:
     """Yield where each image begins, where its name ends, and its rows of ``px`` and ``point``."""
     shown = np.dtype([("px", "<f8", 2), ("point", "<i8")])
     position = 8
     for _ in range(_unpack("Q", data, 0)[0]):
-        end_of_name = data.index(b"\0", position + 64)
+        end_of_name = data.find(b"\0", position + 64)
         (count,) = _unpack("Q", data, end_of_name + 1)
         yield position, end_of_name, np.frombuffer(data, shown, count, end_of_name + 9)
         position = end_of_name + 9 + shown.itemsize * count

@@ -15,6 +15,7 @@ from octasplat.engine.operations.reconstruct import PlainReconstructOptions
 from octasplat.engine.settings.fields import Positional, ReadPath, Spelling, Unit
 
 if TYPE_CHECKING:
+    from octasplat.engine.operations.block_options import BlockOptions
     from octasplat.engine.operations.cost_model import Estimate
     from octasplat.engine.runs.config import ReconstructionConfig
 
@@ -108,7 +109,11 @@ def run(
 
 
 def estimate_scene(
-    scene: Path, config: "ReconstructionConfig", sizes: Sequence[ImageSizes], cores: int = 0
+    scene: Path,
+    config: "ReconstructionConfig",
+    sizes: Sequence[ImageSizes],
+    cores: int = 0,
+    blocks: "BlockOptions | None" = None,
 ) -> "Estimate":
     """Return the estimate of a reconstruction on this machine, with the kernels that it lacks.
 
@@ -117,20 +122,25 @@ def estimate_scene(
         config: settings of the reconstruction.
         sizes: of the photographs.
         cores: to reckon with; 0 takes those of this machine.
+        blocks: how the scene is to be trained in blocks; None stands for not at all.
     """
     from octasplat.engine.dataset.model_sources import has_model
 
-    return estimate_photographs(sizes, config.with_poses_decided(has_model(scene)), cores)
+    return estimate_photographs(sizes, config.with_poses_decided(has_model(scene)), cores, blocks)
 
 
 def estimate_photographs(
-    sizes: Sequence[ImageSizes], config: "ReconstructionConfig", cores: int = 0
+    sizes: Sequence[ImageSizes],
+    config: "ReconstructionConfig",
+    cores: int = 0,
+    blocks: "BlockOptions | None" = None,
 ) -> "Estimate":
     """Return the estimate for photographs of these sizes, where it is decided whether poses are found."""
-    from octasplat.engine.operations.cost_model import estimate_reconstruction
+    from octasplat.engine.operations.block_cost import estimate_with_blocks
+    from octasplat.engine.operations.block_options import BlockOptions
     from octasplat.engine.operations.precompile import cold_start_seconds
 
-    found = estimate_reconstruction(config, sizes, cores or available_threads())
+    found = estimate_with_blocks(config, blocks or BlockOptions(), sizes, cores or available_threads())
     return found.with_cold_start(cold_start_seconds(["reconstruct"]))
 
 

@@ -114,6 +114,7 @@ def run(
         OutputError: the picture cannot be written.
     """
     from octasplat.engine.blocks.block_map import draw_block_map
+    from octasplat.engine.blocks.piece_settings import fewest_blocks
     from octasplat.engine.blocks.sparse_plan import plan_from_points
     from octasplat.engine.dataset import load_dataset_model
     from octasplat.engine.dataset.model_sources import has_model
@@ -137,7 +138,7 @@ def run(
     rule = SplitRule(config.test_every, config.held_out, config.burst_length, config.split)
     trained = split_scene(model, rule).train_indices
     pixels = sum(model.views[index].width_px * model.views[index].height_px for index in trained.tolist())
-    count = asked.count or asked.fewest(config.train, len(trained), pixels)
+    count = asked.count or fewest_blocks(config.train, len(trained), pixels, asked.most_gaussians)
     blocks = plan_from_points(model, trained, count)
     files: tuple[Path, ...] = ()
     if request.picture is not None:
@@ -156,23 +157,15 @@ def _costs(
     cores: int,
 ) -> dict[str, object]:
     """Return the figures of a plan by their names."""
-    from octasplat.engine.blocks.piece_settings import (
-        FINISH_FRACTION,
-        POLISH_FRACTION,
-        block_settings,
-        coarse_settings,
-        coarse_side_px,
-        fits_together,
-        require_blocks_possible,
-    )
+    from octasplat.engine.blocks.piece_settings import require_blocks_possible
     from octasplat.engine.dataset.image_sizes import ImageSizes
+    from octasplat.engine.operations.block_cost import BlockShare, estimate_blocks
     from octasplat.engine.operations.cost_model import estimate_reconstruction
-    from octasplat.engine.train.config import max_gaussian_count
 
     given = config.with_poses_decided(True)
     original = [ImageSizes(info.width_px, info.height_px, 1) for info in model.image_infos]
-    whole = estimate_reconstruction(given, original, cores)
     if len(blocks) == 1:
+        whole = estimate_reconstruction(given, original, cores)
         only = PlannedBlock(
             photographs=blocks[0].view_count,
             pixels=blocks[0].pixel_count,
@@ -182,40 +175,22 @@ def _costs(
         figures = {"seconds": whole.seconds, "memory_bytes": whole.memory_bytes}
         return {"blocks": (only,), "coarse_seconds": 0.0, **figures}
     require_blocks_possible(config)
-    longest = max(max(view.width_px, view.height_px) for view in model.views)
-    smaller = given.model_copy(
-        update={"train": coarse_settings(config.train), "max_side": coarse_side_px(longest)}
-    )
-    coarse = estimate_reconstruction(smaller, original, cores)
-    planned, counts = [], []
-    for block in blocks:
-        train = block_settings(config.train, block.share, most_gaussians, is_finished_later=False)
-        counts.append(max_gaussian_count(train, block.drawn_pixel_count))
-        # as photographs of which all are trained on and all pixels show the block
-        side = max(1, round((block.drawn_pixel_count / max(block.view_count, 1)) ** 0.5))
-        alone = given.model_copy(update={"train": train, "held_out": (), "max_side": None})
-        cost = estimate_reconstruction(alone, [ImageSizes(side, side, max(block.view_count, 1))], cores)
-        planned.append(
-            PlannedBlock(
-                photographs=block.view_count,
-                pixels=block.pixel_count,
-                seconds=cost.stage_seconds["train"],
-                memory_bytes=cost.memory_bytes,
-            )
+    shares = [BlockShare(block.share, block.view_count, block.drawn_pixel_count) for block in blocks]
+    costs = estimate_blocks(given, original, shares, most_gaussians, cores)
+    planned = [
+        PlannedBlock(
+            photographs=block.view_count,
+            pixels=block.pixel_count,
+            seconds=cost.stage_seconds["train"],
+            memory_bytes=cost.memory_bytes,
         )
-    block_seconds = [block.seconds for block in planned]
-    block_bytes = [block.memory_bytes for block in planned]
-    last_seconds = POLISH_FRACTION * max(block_seconds)
-    if fits_together(config.train, counts, [block.share for block in blocks], most_gaussians):
-        last_seconds = FINISH_FRACTION * sum(block_seconds)
-        block_bytes.append(whole.memory_bytes)
-    besides = whole.seconds - whole.stage_seconds["train"]
-    extra = coarse.stage_seconds["train"] + last_seconds
+        for block, cost in zip(blocks, costs.blocks, strict=True)
+    ]
     return {
         "blocks": tuple(planned),
-        "coarse_seconds": round(extra, 1),
-        "seconds": round(besides + extra + sum(block_seconds), 1),
-        "memory_bytes": max(coarse.memory_bytes, *block_bytes),
+        "coarse_seconds": costs.extra_seconds,
+        "seconds": costs.total.seconds,
+        "memory_bytes": costs.total.memory_bytes,
     }
 
 

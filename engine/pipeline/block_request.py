@@ -1,22 +1,17 @@
 """Request to train a scene in blocks: kept with its run, and resolved to their number."""
 
-import math
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from octasplat.engine.blocks.block_plan import MARGIN
-from octasplat.engine.blocks.piece_settings import require_blocks_possible
+from octasplat.engine.blocks.piece_settings import fewest_blocks, require_blocks_possible
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.writing import write_text
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.runs.run_folder import BLOCKS
-from octasplat.engine.train.config import TrainConfig, max_gaussian_count
 from octasplat.engine.train.sampling.pixel_sampler import valid_pixel_fraction
 
-AUTO_VIEWS = 500
-"""Most training views of each block, on average, where the number of blocks is automatic."""
 REQUEST = "request.json"
 
 
@@ -46,30 +41,11 @@ class BlockRequest(BaseModel):
         count = self.count
         if count is None:
             valid = valid_pixel_fraction(dataset) if self.most_gaussians is not None else 1.0
-            count = self.fewest(config.train, len(dataset.train_indices), dataset.train_pixel_count, valid)
+            views, pixels = len(dataset.train_indices), dataset.train_pixel_count
+            count = fewest_blocks(config.train, views, pixels, self.most_gaussians, valid)
         if count > 1:
             require_blocks_possible(config)
         return count
-
-    def fewest(
-        self, config: TrainConfig, views: int, training_pixels: int, valid_fraction: float = 1.0
-    ) -> int:
-        """Return the fewest blocks for so many training views and pixels of them.
-
-        Args:
-            config: settings of the training.
-            views: number of training views.
-            training_pixels: of all of them.
-            valid_fraction: share of the pixels that shows anything.
-        """
-        by_views = math.ceil(views / AUTO_VIEWS)
-        if self.most_gaussians is None:
-            return by_views
-        wanted = max_gaussian_count(config, training_pixels, valid_fraction)
-        if wanted <= self.most_gaussians:
-            return by_views
-        # blocks overlap by their margins
-        return max(by_views, math.ceil(wanted * (1 + 2 * MARGIN) / self.most_gaussians))
 
 
 def keep_request(output: Path, request: BlockRequest | None, *, is_new: bool) -> BlockRequest | None:

@@ -10,14 +10,15 @@ from click.testing import CliRunner
 
 from octasplat.__main__ import cli
 from octasplat.engine.blocks.block_map import SIDE_PX, draw_block_map
+from octasplat.engine.blocks.piece_settings import fewest_blocks
 from octasplat.engine.blocks.sparse_plan import plan_from_points
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.dataset import load_dataset_model
 from octasplat.engine.dataset.image_sizes import ImageSizes
-from octasplat.engine.operations.block_options import parse_memory
+from octasplat.engine.operations.block_cost import estimate_with_blocks
+from octasplat.engine.operations.block_options import BlockOptions, parse_memory
 from octasplat.engine.operations.cost_model import estimate_reconstruction, gaussians_within
 from octasplat.engine.operations.plan import PlanRequest, run
-from octasplat.engine.pipeline import BlockRequest
 from octasplat.engine.runs.config import resolve_config
 from tests.support.tiny_dataset import make_tiny_dataset
 
@@ -70,9 +71,9 @@ def test_map_has_a_color_at_the_middle_of_each_block(scene: Path) -> None:
 
 def test_number_of_blocks_grows_with_photographs_and_with_gaussians_that_do_not_fit() -> None:
     config = resolve_config("standard", assignments=["max_gaussians=1000000"]).train
-    assert [BlockRequest().fewest(config, views, 10**9) for views in (10, 500, 501, 2000)] == [1, 1, 2, 4]
-    assert BlockRequest(most_gaussians=1_000_000).fewest(config, 100, 10**9) == 1
-    assert BlockRequest(most_gaussians=300_000).fewest(config, 100, 10**9) == 4
+    assert [fewest_blocks(config, views, 10**9, None) for views in (10, 500, 501, 2000)] == [1, 1, 2, 4]
+    assert fewest_blocks(config, 100, 10**9, 1_000_000) == 1
+    assert fewest_blocks(config, 100, 10**9, 300_000) == 4
 
 
 def test_gaussians_within_memory_are_those_of_its_estimate() -> None:
@@ -116,3 +117,30 @@ def test_command_prints_the_plan(scene: Path) -> None:
     assert "block 3:" in done.stdout
     refused = CliRunner().invoke(cli, ["plan", str(scene), "--blocks", "none"])
     assert refused.exit_code != 0 and "--blocks" in refused.stderr
+
+
+def test_estimate_before_there_is_a_plan_counts_all_blocks() -> None:
+    config = resolve_config("fast").with_poses_decided(True)
+    photographs = [ImageSizes(800, 600, 900)]
+    whole = estimate_reconstruction(config, photographs, 2)
+    assert estimate_with_blocks(config, BlockOptions(), photographs, 2) == whole
+    assert estimate_with_blocks(config, BlockOptions(blocks=1), photographs, 2) == whole
+    two = estimate_with_blocks(config, BlockOptions(blocks="auto"), photographs, 2)
+    assert two == estimate_with_blocks(config, BlockOptions(blocks=2), photographs, 2)
+    many = estimate_with_blocks(config, BlockOptions(blocks=10_000), photographs, 2)
+    # a training of the preset is as long whatever its photographs show
+    assert 2 < two.stage_seconds["train"] / whole.stage_seconds["train"] < 3
+    assert many.stage_seconds["train"] > 1000 * two.stage_seconds["train"]
+    assert two.seconds - two.stage_seconds["train"] == pytest.approx(
+        whole.seconds - whole.stage_seconds["train"], abs=1
+    )
+    bounded = estimate_with_blocks(config, BlockOptions(blocks=2, memory="1.2G"), photographs, 2)
+    assert bounded.memory_bytes <= 1_200_000_000
+
+
+def test_estimate_without_a_plan_is_near_that_of_the_plan(scene: Path) -> None:
+    options = {"preset": "fast", "blocks": 3, "cores": 2}
+    planned = run(PlanRequest.model_validate({"source": scene, **options}))
+    config = resolve_config("fast").with_poses_decided(True)
+    guessed = estimate_with_blocks(config, BlockOptions(blocks=3), [ImageSizes(96, 64, 12)], 2)
+    assert 0.5 < guessed.seconds / planned.seconds < 2

@@ -62,7 +62,7 @@ def _estimate_sentence(request: ReconstructRequest, threads: int, is_resumed: bo
         return None
     try:
         scene = locate_scene(scene_folder(request))
-        found = estimate_scene(scene, run_config(request), photograph_sizes(scene), threads)
+        found = estimate_scene(scene, run_config(request), photograph_sizes(scene), threads, request)
     except OctasplatError:  # the run refuses what cannot be read, in its own words
         return None
     return f"Estimate: {found.text}, within a factor of two."

@@ -8,10 +8,10 @@ from pydantic import Field
 
 from octasplat.engine.blocks.block_photographs import read_block_photographs
 from octasplat.engine.dataset.image_sizes import ImageSizes
+from octasplat.engine.operations.block_cost import estimate_with_blocks
 from octasplat.engine.operations.block_options import BlockOptions, check_block_options, parse_memory
 from octasplat.engine.operations.cost_model import (
     Estimate,
-    estimate_reconstruction,
     reconstruction_bytes,
     training_pixels,
 )
@@ -163,7 +163,7 @@ class ReconstructKind(OperationKind):
 
     def estimate(self, options: ReconstructJobConfig, sizes: Sequence[ImageSizes], cores: int) -> Estimate:
         """Return the time that it takes as a whole, also in blocks, and the memory: of a block if given."""
-        found = estimate_reconstruction(options, sizes, cores)
+        found = estimate_with_blocks(options, options, sizes, cores)
         if options.memory is None:
             return found
         memory_bytes = min(found.memory_bytes, parse_memory(options.memory))

@@ -1,0 +1,159 @@
+"""Cost of a reconstruction in blocks: the coarse scene, each block, and the end of the training.
+
+As :mod:`octasplat.engine.operations.cost_model`, it imports neither torch nor numba, so that a front end can
+use it.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from octasplat.engine.blocks.piece_settings import (
+    FINISH_FRACTION,
+    MARGIN,
+    POLISH_FRACTION,
+    block_settings,
+    coarse_settings,
+    coarse_side_px,
+    fewest_blocks,
+    fits_together,
+)
+from octasplat.engine.dataset.image_sizes import ImageSizes
+from octasplat.engine.operations.block_options import BlockOptions, parse_memory
+from octasplat.engine.operations.cost_model import (
+    Estimate,
+    capped_sizes,
+    estimate_reconstruction,
+    gaussians_within,
+    held_out_count,
+    training_pixels,
+)
+from octasplat.engine.train.config import max_gaussian_count
+
+if TYPE_CHECKING:
+    from octasplat.engine.runs.config import ReconstructionConfig
+
+
+@dataclass(frozen=True)
+class BlockShare:
+    """What a block takes of a scene.
+
+    Attributes:
+        share: of what is seen, that lies in the block and its margin.
+        view_count: training views that show some of it.
+        drawn_pixel_count: pixels of them, those of each place counted by how much of it shows the block.
+    """
+
+    share: float
+    view_count: int
+    drawn_pixel_count: int
+
+
+@dataclass(frozen=True)
+class BlockCosts:
+    """Estimates of the parts of a reconstruction in blocks, on so many cores.
+
+    Attributes:
+        blocks: each block by itself.
+        extra_seconds: for the coarse scene, and for finishing or polishing the merged one.
+        total: of all of it.
+    """
+
+    blocks: tuple[Estimate, ...]
+    extra_seconds: float
+    total: Estimate
+
+
+def estimate_blocks(
+    config: "ReconstructionConfig",
+    photographs: Sequence[ImageSizes],
+    shares: Sequence[BlockShare],
+    most_gaussians: int | None,
+    cores: int,
+) -> BlockCosts:
+    """Return what a reconstruction in these blocks takes, one after the other.
+
+    Args:
+        config: of the reconstruction, with poses decided.
+        photographs: sizes of the photographs.
+        shares: of the blocks.
+        most_gaussians: of any block; None for no such limit.
+        cores: to reckon with.
+    """
+    whole = estimate_reconstruction(config, photographs, cores)
+    shrunk = [capped_sizes(sizes, config.max_side) for sizes in photographs]
+    longest = max((max(sizes.width_px, sizes.height_px) for sizes in shrunk), default=1)
+    smaller = config.model_copy(
+        update={"train": coarse_settings(config.train), "max_side": coarse_side_px(longest)}
+    )
+    coarse = estimate_reconstruction(smaller, photographs, cores)
+    # Blocks that are alike, as thousands of an even guess, are reckoned once.
+    found = {block: _estimate_block(config, block, most_gaussians, cores) for block in dict.fromkeys(shares)}
+    costs, counts = zip(*(found[block] for block in shares), strict=True)
+    block_seconds = [cost.stage_seconds["train"] for cost in costs]
+    block_bytes = [cost.memory_bytes for cost in costs]
+    last_seconds = POLISH_FRACTION * max(block_seconds)
+    if fits_together(config.train, counts, [block.share for block in shares], most_gaussians):
+        last_seconds = FINISH_FRACTION * sum(block_seconds)
+        block_bytes.append(whole.memory_bytes)
+    extra = coarse.stage_seconds["train"] + last_seconds
+    longer = extra + sum(block_seconds) - whole.stage_seconds["train"]
+    seconds = whole.seconds + longer
+    total = whole.model_copy(
+        update={
+            "seconds": round(seconds, 1),
+            "cpu_seconds": round(whole.cpu_seconds * seconds / whole.seconds, 1),
+            "memory_bytes": max(coarse.memory_bytes, *block_bytes),
+            "stage_seconds": {
+                **whole.stage_seconds,
+                "train": round(extra + sum(block_seconds), 1),
+            },
+        }
+    )
+    return BlockCosts(costs, round(extra, 1), total)
+
+
+def _estimate_block(
+    config: "ReconstructionConfig", block: BlockShare, most_gaussians: int | None, cores: int
+) -> tuple[Estimate, int]:
+    """Return the estimate of the training of a block by itself, and its most Gaussians."""
+    train = block_settings(config.train, block.share, most_gaussians, is_finished_later=False)
+    # as photographs of which all are trained on and all pixels show the block
+    views = max(block.view_count, 1)
+    side = max(1, round((block.drawn_pixel_count / views) ** 0.5))
+    alone = config.model_copy(update={"train": train, "held_out": (), "max_side": None})
+    cost = estimate_reconstruction(alone, [ImageSizes(side, side, views)], cores)
+    return cost, max_gaussian_count(train, block.drawn_pixel_count)
+
+
+def estimate_with_blocks(
+    config: "ReconstructionConfig", options: BlockOptions, photographs: Sequence[ImageSizes], cores: int
+) -> Estimate:
+    """Return the estimate of a reconstruction in the blocks that its options ask for, all alike.
+
+    What each block takes is known when there is a model (``octasplat plan``); until then each is reckoned
+    with an equal part of what the photographs show, and its margin.
+
+    Args:
+        config: of the reconstruction, with poses decided.
+        options: of the blocks.
+        photographs: sizes of the photographs.
+        cores: to reckon with.
+
+    Raises:
+        ConfigError: the memory is no size.
+    """
+    most = None
+    if options.memory is not None:
+        most = max(1, gaussians_within(config, photographs, parse_memory(options.memory)))
+    count = sum(sizes.count for sizes in photographs)
+    views, pixels = count - held_out_count(config, count), training_pixels(config, photographs)
+    blocks = options.blocks
+    if blocks == "auto":
+        blocks = fewest_blocks(config.train, views, pixels, most)
+    if blocks is None or blocks == 1:
+        return estimate_reconstruction(config, photographs, cores)
+    share = min(1.0, (1 + 2 * MARGIN) / blocks)
+    each = BlockShare(share, max(1, min(views, math.ceil(2 * share * views))), max(1, round(share * pixels)))
+    return estimate_blocks(config, photographs, [each] * blocks, most, cores).total
