@@ -59,7 +59,7 @@ _PAPER_GAUSSIANS = 60_000
 """What clone and split comes to, whatever its cap."""
 _START_BYTES = 300 << 20
 _MODEL_BYTES_PER_PHOTOGRAPH = 400_000
-"""For a model of COLMAP while it is read, of 3,000 to 8,000 features in each photograph; 590,000 were measured
+"""For a model of COLMAP while it is read, of 3,000 to 8,000 features in each; 590,000 were measured
 where 7,400 of them showed points."""
 _MATERIAL_START_BYTES, _MATERIAL_TRAIN_BYTES = 1_370 << 20, 500 << 20
 """What materials take whatever the photographs, as they begin and later on."""
