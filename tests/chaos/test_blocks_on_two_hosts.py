@@ -9,6 +9,7 @@ from octasplat.engine.pipeline import BlockRequest, reconstruct
 from octasplat.workers.db.live_scenes import get_live_scene
 from octasplat.workers.db.rows import Job
 from octasplat.workers.queue.block_jobs import blocks_of
+from octasplat.workers.worker.dataset_folder import FILLED_BY_NEED
 from octasplat.workers.worker.job_kinds import get_job_kind
 from octasplat.workers.worker.job_kinds.reconstruct_kinds import ReconstructJobConfig
 from tests.support.stored_dataset import store_dataset
@@ -55,7 +56,7 @@ def test_block_job_is_completed_by_the_host_that_lives(two: Hosts, tmp_path: Pat
     )
     # The second host has the photographs of its block, and no others.
     busy = {block.worker: block for block in blocks()}
-    (place,) = (two.data(1) / "work" / "datasets" / str(dataset_id)).glob("[!.]*/images")
+    (place,) = (two.data(1) / "work" / "datasets" / f"{dataset_id}{FILLED_BY_NEED}").glob("[!.]*/images")
     there = {int(path.stem) for path in place.iterdir() if path.stat().st_size}
     assert there == SHOWN[busy["host1"].options["number"]] and len(list(place.iterdir())) == 16
 

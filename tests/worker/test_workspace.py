@@ -18,6 +18,7 @@ from octasplat.workers.storage.errors import StorageFullError, StorageUnavailabl
 from octasplat.workers.storage.local import LocalStorage
 from octasplat.workers.storage.trees import TreeFile
 from octasplat.workers.worker import workspace_locks
+from octasplat.workers.worker.dataset_folder import FILLED_BY_NEED
 from octasplat.workers.worker.path_redaction import PathRedactor
 from octasplat.workers.worker.stored_frames import StoredFrames
 from octasplat.workers.worker.task import FRAMES_FOLDER, RUN_FOLDER
@@ -89,7 +90,9 @@ def test_photographs_are_fetched_once_a_host_and_only_those_needed(
         list(pool.map(lambda last: fill(1, 2, last), (2, 3)))
     assert fill() == {number: bytes([number]) * 10 for number in range(5)}
     assert sorted(fetched) == sorted(file.sha256 for file in files)
-    left = tmp_path / "work" / "datasets" / str(dataset)
+    # An earlier version beside this one would take a folder called by the id for complete.
+    (left,) = (tmp_path / "work" / "datasets").iterdir()
+    assert left.name == f"{dataset}{FILLED_BY_NEED}"
     assert {path.name for path in left.iterdir()} == {"d", LOCK_FILE}
 
 

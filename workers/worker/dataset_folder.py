@@ -19,6 +19,11 @@ from octasplat.workers.storage.protocol import Storage
 from octasplat.workers.worker.workspace_locks import lock_dataset_folder
 
 
+FILLED_BY_NEED = ".files"
+"""Follows the id in the name of the folder: earlier versions, which may run beside this one, take a folder
+that is called by the id alone for complete."""
+
+
 class DatasetFolder:
     """The photographs of a dataset, kept from being swept until :meth:`close`; they must not be changed.
 
@@ -32,7 +37,7 @@ class DatasetFolder:
     """
 
     def __init__(self, root: Path, dataset_id: uuid.UUID, name: str) -> None:
-        self._folder = root / "datasets" / str(dataset_id)
+        self._folder = root / "datasets" / f"{dataset_id}{FILLED_BY_NEED}"
         with translate_os_errors(self._folder):
             self._lock: IO[bytes] = lock_dataset_folder(self._folder)
         self.place = self._folder / (re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_")[:60] or "scene")
