@@ -18,7 +18,6 @@ from octasplat.workers.storage.os_errors import translate_os_errors
 from octasplat.workers.storage.protocol import Storage
 from octasplat.workers.worker.workspace_locks import lock_dataset_folder
 
-
 FILLED_BY_NEED = ".files"
 """Follows the id in the name of the folder: earlier versions, which may run beside this one, take a folder
 that is called by the id alone for complete."""
