@@ -120,6 +120,6 @@ class _GroupMedians:
         medians = np.zeros(self._count)
         for groups, places in self._matrices:
             low, high = (places.shape[1] - 1) // 2, places.shape[1] // 2
-            parted = np.partition(values[places], (low, high), axis=1)
-            medians[groups] = (parted[:, low] + parted[:, high]) / 2
+            partitioned = np.partition(values[places], (low, high), axis=1)
+            medians[groups] = (partitioned[:, low] + partitioned[:, high]) / 2
         return medians
