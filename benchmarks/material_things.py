@@ -28,7 +28,7 @@ from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset.synthetic.colmap_writer import write_model
 from octasplat.engine.dataset.synthetic.files import write_channels
 from octasplat.engine.dataset.synthetic.photograph_renderer import rays_world
-from octasplat.engine.dataset.synthetic.points import SurfacePoints
+from octasplat.engine.dataset.synthetic.points import SurfacePoints, list_observations
 from octasplat.engine.dataset.synthetic.synthetic_views import SyntheticView, directions_cam, project_visible
 from octasplat.engine.pathtracing.denoising import load_denoiser
 from octasplat.engine.render.environment_files import write_environment
@@ -181,7 +181,8 @@ def sample_points(
     observed[np.argsort(np.argsort(order, axis=1), axis=1) >= MAX_TRACK] = np.nan
     good = np.flatnonzero(np.isfinite(observed[..., 0]).sum(axis=1) >= 2)[:count]
     noisy = xyz[good] + random.normal(0, POINT_NOISE, (len(good), 3))
-    return SurfacePoints(noisy, to_bytes(linear_to_srgb(rgb[good]).astype(np.float32)), observed[good])
+    colors_srgb8 = to_bytes(linear_to_srgb(rgb[good]).astype(np.float32))
+    return SurfacePoints(noisy, colors_srgb8, *list_observations(observed[good]))
 
 
 class Photographs:
@@ -303,7 +304,8 @@ def write_thing(
                 write_png(where / view.name, *photographs.take(view, samples, seed))
     (folder / "thing.ply").unlink()
     write_model(folder / "sparse" / "0", camera, train, sample_points(surface, camera, train, sizes.points))
-    nothing = SurfacePoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, len(test), 2)))
+    unseen = list_observations(np.zeros((0, len(test), 2)))
+    nothing = SurfacePoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), *unseen)
     write_model(folder / "test" / "sparse" / "0", camera, test, nothing)
     for view in test:
         write_truth_maps(folder / "test", surface, camera, view)

@@ -125,7 +125,7 @@ def test_surface_ply_and_obj_round_trip(surface, textured, tmp_path):
 
 
 def test_extract_unwritable_file_is_refused(surface, textured, tmp_path):
-    with pytest.raises(ConfigError, match=r"\.glb, \.ply or \.obj"):
+    with pytest.raises(ConfigError, match=r"\.glb, \.ply, \.obj or \.usdz"):
         write_surface(surface.mesh, tmp_path / "a.stl")
     with pytest.raises(ConfigError, match="no texture"):
         write_surface(textured, tmp_path / "a.ply")

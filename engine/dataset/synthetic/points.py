@@ -39,6 +39,14 @@ class SurfacePoints:
     observed_px: Float[np.ndarray, "m 2"]
 
 
+def list_observations(
+    observed_px: Float[np.ndarray, "n views 2"],
+) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, "m 2"]]:
+    """Return row of the point, view and image position of each observation; not-a-number is none."""
+    rows, views = np.nonzero(np.isfinite(observed_px[..., 0]))
+    return rows, views, observed_px[rows, views]
+
+
 def sample_surface_points(
     scene: LitScene, camera: pycolmap.Camera, views: list[SyntheticView], config: SyntheticDatasetConfig
 ) -> SurfacePoints:
@@ -64,8 +72,8 @@ def sample_surface_points(
         order = random.permutation(np.flatnonzero(good))[: config.points - found]
         places.append(xyz[order])
         colors.append(rgb[order])
-        rows, seeing = np.nonzero(np.isfinite(observed[order, :, 0]))
-        tracks.append((found + rows, seeing, observed[order[rows], seeing]))
+        rows, seeing, observed_px = list_observations(observed[order])
+        tracks.append((found + rows, seeing, observed_px))
         found += len(order)
         if found == config.points:
             break
