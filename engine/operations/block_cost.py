@@ -105,10 +105,7 @@ def estimate_blocks(
             "seconds": round(seconds, 1),
             "cpu_seconds": round(whole.cpu_seconds * seconds / whole.seconds, 1),
             "memory_bytes": max(coarse.memory_bytes, *block_bytes),
-            "stage_seconds": {
-                **whole.stage_seconds,
-                "train": round(extra + sum(block_seconds), 1),
-            },
+            "stage_seconds": {**whole.stage_seconds, "train": round(extra + sum(block_seconds), 1)},
         }
     )
     return BlockCosts(costs, round(extra, 1), total)
@@ -152,7 +149,7 @@ def estimate_with_blocks(
     blocks = options.blocks
     if blocks == "auto":
         blocks = fewest_blocks(config.train, views, pixels, most)
-    if blocks is None or blocks == 1:
+    if blocks is None or blocks <= 1:  # auto makes none of no photographs
         return estimate_reconstruction(config, photographs, cores)
     share = min(1.0, (1 + 2 * MARGIN) / blocks)
     each = BlockShare(share, max(1, min(views, math.ceil(2 * share * views))), max(1, round(share * pixels)))

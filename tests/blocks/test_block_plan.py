@@ -125,6 +125,9 @@ def test_estimate_before_there_is_a_plan_counts_all_blocks() -> None:
     whole = estimate_reconstruction(config, photographs, 2)
     assert estimate_with_blocks(config, BlockOptions(), photographs, 2) == whole
     assert estimate_with_blocks(config, BlockOptions(blocks=1), photographs, 2) == whole
+    nothing = estimate_with_blocks(config, BlockOptions(blocks="auto"), [], 2)
+    assert nothing == estimate_reconstruction(config, [], 2)
+    assert estimate_with_blocks(config, BlockOptions(blocks=3), [], 2).seconds > nothing.seconds
     two = estimate_with_blocks(config, BlockOptions(blocks="auto"), photographs, 2)
     assert two == estimate_with_blocks(config, BlockOptions(blocks=2), photographs, 2)
     many = estimate_with_blocks(config, BlockOptions(blocks=10_000), photographs, 2)
