@@ -44,11 +44,22 @@ def checked_modules() -> list[str]:
 shape_checks.install(checked_modules())
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the option for tests that the daily run leaves out."""
+    parser.addoption(
+        "--exhaustive",
+        action="store_true",
+        help="run the tests marked exhaustive, too, which a run of whole folders leaves out",
+    )
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Files are handed out in the order of the items; xdist would begin with those of the most tests.
 
     Modules are compiled before, as the processes of jobs, which may write nothing, only read them so.
     """
+    names_files = any(".py" in argument for argument in config.args)
+    config.option.exhaustive |= names_files or "exhaustive" in config.option.markexpr
     if not hasattr(config, "workerinput"):
         for package in ("engine", "workers", "service"):
             compileall.compile_dir(ROOT / package, quiet=1)
@@ -56,8 +67,16 @@ def pytest_configure(config: pytest.Config) -> None:
         config.option.loadscopereorder = False
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What takes long comes first, so that no process is left with it when the others have nothing to do."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """What takes long comes first, so that no process is left with it when the others have nothing to do.
+
+    Tests marked exhaustive are left out of a run of whole folders. They run with ``--exhaustive``, and where
+    files or this marker are asked for.
+    """
+    if not config.option.exhaustive:
+        left_out = [item for item in items if item.get_closest_marker("exhaustive")]
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if not item.get_closest_marker("exhaustive")]
     items.sort(key=lambda item: LONGEST_FIRST.get(item.path.name, len(LONGEST_FIRST)))
 
 

@@ -148,6 +148,7 @@ def test_killed_while_training_again_and_again(scene: Path, whole_run: Path, tmp
     assert max(iterations) == ITERATIONS
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("stage", ["load", "evaluate", "export"])
 def test_killed_in_another_stage(scene: Path, surface_run: Path, tmp_path: Path, stage: str) -> None:
     moments = random.Random(stage)
@@ -177,6 +178,7 @@ def test_killed_in_another_stage(scene: Path, surface_run: Path, tmp_path: Path,
     assert_same(run, surface_run)
 
 
+@pytest.mark.exhaustive
 def test_pipeline_independent_of_threads(scene: Path, surface_run: Path, tmp_path: Path) -> None:
     run = reconstruct(scene, tmp_path / "run", make_config(**WITH_SURFACE), threads=2)
     assert_same(run, surface_run)

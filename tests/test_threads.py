@@ -55,6 +55,7 @@ def test_torch_gets_its_threads_back_after_a_failure() -> None:
     assert torch.get_num_threads() == 2
 
 
+@pytest.mark.exhaustive
 @pytest.mark.heavy
 def test_run_with_one_thread_uses_one(tmp_path: Path) -> None:
     """A whole command takes hardly more CPU time than time on the clock, whatever the environment says."""

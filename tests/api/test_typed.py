@@ -4,6 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from platformdirs import user_cache_path
 
 PROGRAM = Path(__file__).with_name("user_program.py")
@@ -37,6 +38,7 @@ def check(program: Path, folder: Path) -> tuple[int, str]:
     return done.returncode, done.stdout
 
 
+@pytest.mark.exhaustive
 def test_program_of_a_user_passes_mypy_strict_and_wrong_ones_do_not(tmp_path: Path) -> None:
     assert check(PROGRAM, tmp_path) == (0, "Success: no issues found in 1 source file\n")
     wrong = tmp_path / "wrong.py"

@@ -38,6 +38,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_tiny_dataset(tmp_path_factory, views=12, width_px=64, height_px=48)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("most_gaussians", [None, 450])
 def test_pieces_in_folders_of_their_own_give_the_same_bytes(
     scene: Path, tmp_path: Path, most_gaussians: int | None

@@ -95,6 +95,7 @@ def psnr(run: Path) -> float:
     return float(json.loads((run / "metrics.json").read_text())["mean"]["psnr"])
 
 
+@pytest.mark.exhaustive
 def test_two_blocks_are_as_good_as_the_whole(two_blocks: tuple, whole: Path) -> None:
     assert psnr(two_blocks[0]) > psnr(whole) - MAX_LOSS_DB
     assert not (whole / "blocks").exists()
@@ -170,6 +171,7 @@ def stop_at(condition: Callable[[Event], bool]) -> tuple[Callable[[Event], None]
     return listen, lambda: bool(met)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("place", ["coarse", "block_001", "block_002", "finish"])
 def test_stopped_run_ends_with_the_same_bytes(
     scene: Path, short_blocks: Path, tmp_path: Path, place: str

@@ -24,6 +24,7 @@ def machine(short_root: Path) -> Iterator[Machine]:
         machine.stop()
 
 
+@pytest.mark.exhaustive
 def test_jobs_survive_random_kills(machine: Machine, tmp_path: Path) -> None:
     scene = make_scene(tmp_path / "scene")
     expected = undisturbed_reconstruction(scene, tmp_path / "undisturbed")

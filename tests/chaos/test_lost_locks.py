@@ -36,6 +36,7 @@ def bench(conninfo: str, tmp_path: Path) -> Iterator[WorkerHarness]:
     bench.close()
 
 
+@pytest.mark.exhaustive
 def test_job_recovers_after_lock_holder_vanishes(bench: WorkerHarness) -> None:
     first = bench.worker(name="first")
     job_id = bench.submit(options={"steps": 100, "seconds": 0.05})

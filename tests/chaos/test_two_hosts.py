@@ -21,6 +21,7 @@ STEPS = 40
 PHOTOGRAPHS = {"images/a.png": b"not looked at by this kind", "images/b.png": b"x" * 100_000}
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("how", ["dead", "cut off"])
 def test_job_of_disconnected_host_is_recovered_by_second_host(two: Hosts, tmp_path: Path, how: str) -> None:
     bench = two.bench

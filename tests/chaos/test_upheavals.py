@@ -12,6 +12,7 @@ from benchmarks.chaos_upheavals import UPHEAVALS, report, upheave
 pytestmark = pytest.mark.heavy
 
 
+@pytest.mark.exhaustive
 def test_jobs_survive_random_faults(short_root: Path, tmp_path: Path) -> None:
     # No worker is lost, and one that a busy machine keeps waiting is not to be missed.
     machine = Machine(short_root / "upheavals", slots=2, settings={"STALE_SECONDS": "30"})

@@ -4,6 +4,7 @@ import shlex
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ VERBS = {
 """What runs here; the commands of the service have tests of their own."""
 PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md")), DOCS / "opening" / "blender.md"]
 WITH_MATERIALS = {"docs/materials.md"}
+LONG = {*WITH_MATERIALS, "docs/results.md"}
 PHOTOGRAPHS = (
     "SCENE", "SCENE/test", "PHOTOS", "PHOTOGRAPHS", "SITE", "fox", "shiny_knot", "shiny_knot/test",
     "still_life",
@@ -55,15 +57,18 @@ LIT_SURFACE = {"--texture-size": "128", "--max-triangles": "400"}
 """What a surface with materials has by itself, larger."""
 
 
-def runnable() -> list[DocumentedCommand]:
-    """Return the commands that can run without a service, each once."""
+def runnable() -> list[Any]:
+    """Return the commands that can run without a service, each once; those that take long are exhaustive."""
     found = {
         (command.page, command.words): command
         for page in PAGES
         for command in commands(page)
         if command.words and command.words[0] in VERBS
     }
-    return list(found.values())
+    return [
+        pytest.param(command, marks=[pytest.mark.exhaustive] if command.page in LONG else [])
+        for command in found.values()
+    ]
 
 
 @pytest.fixture(scope="module")

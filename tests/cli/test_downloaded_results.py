@@ -63,6 +63,7 @@ def results(scene, tmp_path_factory) -> Results:
     return Results(downloaded, scene, warnings)
 
 
+@pytest.mark.exhaustive
 def test_retry_with_incompatible_state_restarts_with_warning(results):
     (told,) = [warning for warning in results.warnings if "begins anew" in warning]
     assert (

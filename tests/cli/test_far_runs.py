@@ -65,6 +65,7 @@ def call(octasplat, *arguments: object) -> str:
     return result.output
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("integrator", ["split-sum", "path"])
 def test_far_run_is_relit_as_at_the_origin(octasplat, runs, others, tmp_path, integrator):
     light = np.linspace(0.1, 3.0, 16 * 32 * 3, dtype=np.float32).reshape(16, 32, 3)
@@ -85,6 +86,7 @@ def test_far_run_is_relit_as_at_the_origin(octasplat, runs, others, tmp_path, in
     assert any(np.ptp(read_image(path)) > 0 for path in near)
 
 
+@pytest.mark.exhaustive
 def test_far_run_is_measured_as_at_the_origin(octasplat, runs, others):
     found = []
     for folder, scene in zip(runs, others, strict=True):

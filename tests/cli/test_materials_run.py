@@ -62,6 +62,7 @@ def test_materials_run_evaluates_shaded_images(materials_run, octasplat):
     assert "Traceback" not in result.output
 
 
+@pytest.mark.exhaustive
 def test_materials_run_resumes_to_same_bytes(
     materials_run, scene, start_octasplat, tiny, octasplat, tmp_path
 ):
@@ -171,6 +172,7 @@ def test_run_merged_with_scene_without_materials_shows_harmonics(materials_run, 
         assert path.read_bytes() == (tmp_path / "harmonics" / path.name).read_bytes()
 
 
+@pytest.mark.exhaustive
 def test_cameras_of_other_photographs_change_no_shading(materials_run, octasplat, tmp_path, tmp_path_factory):
     """The extent by which reflections keep off surfaces is that of the training."""
     few = make_tiny_dataset(tmp_path_factory, views=3)

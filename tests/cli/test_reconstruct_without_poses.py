@@ -37,6 +37,7 @@ def test_reconstruct_without_poses_names_alternatives(photographs, octasplat, tm
     assert "--poses auto" in refused.stderr and "octasplat submit" in refused.stderr
 
 
+@pytest.mark.exhaustive
 def test_poses_are_found_in_the_run_and_the_same_on_any_threads(photographs, octasplat, tmp_path, tiny):
     runs = [tmp_path / "one", tmp_path / "two"]
     for threads, output in enumerate(runs, start=1):

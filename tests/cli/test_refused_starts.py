@@ -96,6 +96,7 @@ def test_poses_are_kept_when_the_settings_are_refused(octasplat, tmp_path, tiny)
     assert "features" not in done.stdout and (output / "poses/images.bin").read_bytes() == found
 
 
+@pytest.mark.exhaustive
 def test_second_process_on_same_run_is_refused(scene, octasplat, start_octasplat, tmp_path, tiny):
     output = tmp_path / "out"
     settings = [*tiny, "--iterations", "100000"]

@@ -41,6 +41,7 @@ def request_of(verb: str, run: Path, output: Path, **given: Any) -> tuple[Any, A
     return relight, relight.RelightRequest(source=run, output=output, **light, **given)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("verb", ["render", "relight"])
 def test_changed_middle_photograph_starts_new_render(shiny_run, tmp_path, verb):
     names = [view["name"] for view in json.loads((shiny_run / "views.json").read_text())["views"]]

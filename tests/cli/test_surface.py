@@ -108,6 +108,7 @@ def test_surface_invalid_options_are_refused(run, octasplat, tmp_path, bad):
     assert bad[1].split(",")[-1] in result.output
 
 
+@pytest.mark.exhaustive
 def test_surface_interrupted_leaves_no_files(run, start_octasplat, tmp_path):
     process = start_octasplat(
         "surface", run.output, "-o", tmp_path / "a.ply", "--depth-side", 64, "--resolution", 2000,

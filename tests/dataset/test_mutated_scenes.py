@@ -179,6 +179,7 @@ MUTATIONS: dict[str, Mutation] = {
 CHANGES = st.lists(st.tuples(st.sampled_from(sorted(MUTATIONS)), st.integers(0, 500)), min_size=1, max_size=3)
 
 
+@pytest.mark.exhaustive
 @settings(
     max_examples=200,
     deadline=None,

@@ -47,6 +47,7 @@ def image(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return environment
 
 
+@pytest.mark.exhaustive
 def test_front_end_and_maintenance_run_without_torch(image: Path, conninfo: str, tmp_path: Path) -> None:
     python = image / "bin" / "python3"
     listed = subprocess.run([python, "-m", "pip", "list", "--format=json"], capture_output=True, check=True)

@@ -82,6 +82,7 @@ def twist_by(angle: float, axis: int, points: np.ndarray) -> np.ndarray:
     return moved
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("name", ["mesh.ply", "mesh.glb"])
 def test_cutting_copying_and_welding(blender, make_scene: Make, tmp_path: Path, name: str) -> None:
     g = make_scene(300)

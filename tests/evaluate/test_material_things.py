@@ -111,6 +111,7 @@ def test_folder_can_be_trained_on(folder: Path) -> None:
     assert np.allclose(read_environment(truth.environment), slope(map_directions(64)), atol=0.01)
 
 
+@pytest.mark.exhaustive
 def test_truths_put_into_a_run_bring_it_nearer_to_the_pictures(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

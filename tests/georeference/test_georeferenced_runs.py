@@ -51,6 +51,7 @@ def test_run_states_where_it_lies(run):
     assert read_metadata(run).georeference == found == read_metadata(run / "scene.ply").georeference
 
 
+@pytest.mark.exhaustive
 def test_scene_has_the_bytes_of_a_run_without_and_off_says_nothing(run, scene, plain, tmp_path):
     osp.reconstruct(plain, tmp_path / "plain", **OPTIONS)
     osp.reconstruct(scene, tmp_path / "off", **OPTIONS, georeference="off")

@@ -344,6 +344,7 @@ def damaged_models(draw: st.DrawFn) -> dict[str, bytes]:
     return files
 
 
+@pytest.mark.exhaustive
 @pytest.mark.heavy
 @settings(
     deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], database=None, max_examples=15
@@ -360,6 +361,7 @@ def test_dataset_damaged_model_is_refused(local_storage: LocalStorage, files: di
         assert answer.views >= 3
 
 
+@pytest.mark.exhaustive
 @pytest.mark.real
 def test_dataset_of_real_scene_is_accepted(scenes_root: Path, local_storage: LocalStorage) -> None:
     checked = 0

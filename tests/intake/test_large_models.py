@@ -4,6 +4,7 @@ import struct
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from octasplat.service.intake.model_check import ModelLimits, check_model
 from octasplat.workers.storage.local import LocalStorage
@@ -55,6 +56,7 @@ def model_files(points: int) -> dict[str, bytes]:
     }
 
 
+@pytest.mark.exhaustive
 def test_model_of_many_points_fits_into_the_memory_of_its_reader(tmp_path: Path) -> None:
     storage = LocalStorage(tmp_path / "store", floor_bytes=0)
     model = []

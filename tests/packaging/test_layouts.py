@@ -92,6 +92,7 @@ WAYS: dict[str, Callable[[Environment, Path], None]] = {
 }
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("way", WAYS)
 def test_installed_program_runs_beside_packages_of_the_same_names(
     way: str, project: Path, elsewhere: Path, tmp_path: Path

@@ -120,6 +120,7 @@ def test_poses_are_those_of_the_cameras(taken: Photographs, found_at_once: Found
     assert again == []
 
 
+@pytest.mark.exhaustive
 def test_poses_are_found_by_a_confined_job(
     taken: Photographs, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
@@ -172,6 +173,7 @@ def test_find_poses_should_stop_cancels(taken: Photographs, tmp_path: Path) -> N
     assert [path.name for path in tmp_path.iterdir()] == [".out.work"]
 
 
+@pytest.mark.exhaustive
 def test_stopped_search_goes_on_with_its_features_and_matches(
     taken: Photographs, found_at_once: Found, tmp_path: Path
 ) -> None:
@@ -203,6 +205,7 @@ def test_stopped_search_goes_on_with_its_features_and_matches(
     assert [path.name for path in tmp_path.iterdir()] == ["stopped"]
 
 
+@pytest.mark.exhaustive
 def test_stopped_search_with_other_settings_begins_anew(taken: Photographs, tmp_path: Path) -> None:
     counted: list[int] = []
 
@@ -220,6 +223,7 @@ def test_stopped_search_with_other_settings_begins_anew(taken: Photographs, tmp_
         assert counted[0] < 8
 
 
+@pytest.mark.exhaustive
 def test_pose_search_is_deterministic(taken: Photographs, tmp_path: Path) -> None:
     images = tmp_path / "images"
     images.mkdir()
@@ -278,6 +282,7 @@ def test_unreadable_file_takes_no_image_id(taken: Photographs, tmp_path: Path, k
     assert [link.resolve().name for link in links] == ["0b.png", "1b.png", "2b.png"]
 
 
+@pytest.mark.exhaustive
 def test_poses_go_to_the_photographs_they_are_of(taken: Photographs, tmp_path: Path) -> None:
     images = tmp_path / "images"
     shutil.copytree(taken.folder, images)

@@ -129,6 +129,7 @@ def test_photograph_with_few_points_keeps_lens(moved: Path, tmp_path: Path) -> N
     np.testing.assert_allclose(poses[0], poses[1], atol=1e-12)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.heavy
 def test_lens_fit_runs_during_reconstruction_and_resumes(moved: Path, tmp_path: Path) -> None:
     output, events = tmp_path / "run", list[Event]()

@@ -43,6 +43,7 @@ def street(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str], n
     return path, names, place
 
 
+@pytest.mark.exhaustive
 def test_vocabulary_proposes_photographs_of_one_place(
     street: tuple[Path, list[str], np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -61,6 +61,7 @@ def assert_swapped(before: dict[str, np.ndarray], after: dict[str, np.ndarray]) 
         np.testing.assert_allclose(after[name], before[name], atol=1e-12)
 
 
+@pytest.mark.exhaustive
 def test_pose_repair_moves_contradicted_photographs(scene: Path, tmp_path: Path) -> None:
     model = scene / "sparse" / "0"
     before = poses(model)
@@ -106,6 +107,7 @@ def stages_until(last: str, scene: Path, output: Path, *settings: str) -> list[s
     return reconstruct_until(last, scene, output, config)
 
 
+@pytest.mark.exhaustive
 def test_pose_repair_runs_during_reconstruction(scene: Path, tmp_path: Path) -> None:
     output = tmp_path / "run"
     assert stages_until("check", scene, output) == ["load", "check"]

@@ -35,6 +35,7 @@ def test_changelog_has_sections_of_unreleased_changes_and_of_the_version() -> No
     }  # fmt: skip
 
 
+@pytest.mark.exhaustive
 @pytest.mark.heavy
 def test_release_is_rehearsed(tmp_path: Path) -> None:
     def tags() -> str:

@@ -60,6 +60,7 @@ def finish_jobs(bench: WorkerHarness, jobs: list[str]) -> None:
         bench.close()
 
 
+@pytest.mark.exhaustive
 async def test_restored_service_continues_jobs(
     conninfo: str, postgres: EmbeddedPostgres, template: str, tmp_path: Path
 ) -> None:

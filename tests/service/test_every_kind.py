@@ -233,6 +233,7 @@ async def test_jobs_give_the_scenes_of_the_commands(
     assert jobs.kinds == SCENE_KINDS
 
 
+@pytest.mark.exhaustive
 async def test_every_other_kind_of_job_succeeds(
     database: str,
     data: Path,

@@ -95,6 +95,7 @@ def sharp(monkeypatch: pytest.MonkeyPatch) -> None:
     )  # file times have the resolution of a tick
 
 
+@pytest.mark.exhaustive
 async def test_garbage_collection_spares_contents_of_running_uploads(
     conninfo: str, tmp_path: Path, sharp: None
 ) -> None:

@@ -104,6 +104,7 @@ def python_environment() -> Path:
     return programs
 
 
+@pytest.mark.exhaustive
 def test_generated_python_client_submits_waits_and_downloads(
     server: str, document: Path, scene: Path, tmp_path: Path
 ) -> None:
@@ -122,6 +123,7 @@ def test_generated_python_client_submits_waits_and_downloads(
     check_result(tmp_path / "result", done.stdout)
 
 
+@pytest.mark.exhaustive
 def test_generated_typescript_client_submits_waits_and_downloads(
     server: str, document: Path, scene: Path, tmp_path: Path
 ) -> None:

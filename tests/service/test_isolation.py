@@ -62,6 +62,7 @@ def served(project: Path, short_root: Path, tmp_path: Path) -> Iterator[Api]:
     assert process.wait(120) == 0
 
 
+@pytest.mark.exhaustive
 def test_serve_ignores_modules_in_current_folder(served: Api, project: Path, tmp_path: Path) -> None:
     config = SyntheticDatasetConfig(views=4, width_px=16, height_px=12, samples_per_side=1, points=60)
     write_synthetic_dataset(tmp_path / "scene", config)

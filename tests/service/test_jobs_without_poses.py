@@ -78,6 +78,7 @@ def test_reconstruct_folder_without_poses_succeeds(
         assert finished == job["stages"]
 
 
+@pytest.mark.exhaustive
 def test_job_with_unrelated_photographs_fails_with_reason(
     machine: Machine, octasplat: Octasplat, tmp_path: Path
 ) -> None:

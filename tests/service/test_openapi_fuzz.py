@@ -118,6 +118,7 @@ AST_IN_THREADS = "AST constructor recursion depth mismatch"
 """CPython 3.11 now and then says so where two threads parse; schemathesis does, and must begin again."""
 
 
+@pytest.mark.exhaustive
 def test_fuzzed_requests_cause_no_server_error(front_end: FrontEnd, conninfo: str, tmp_path: Path) -> None:
     environment = {
         **os.environ,

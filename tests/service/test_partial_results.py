@@ -138,6 +138,7 @@ def machine(short_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     machine.stop()
 
 
+@pytest.mark.exhaustive
 @pytest.mark.heavy
 def test_failed_export_keeps_other_results_and_retry_skips_training(machine: Machine, tmp_path: Path) -> None:
     config = SyntheticDatasetConfig(views=8, width_px=48, height_px=36, samples_per_side=1, points=500)

@@ -157,6 +157,7 @@ def check_what_is_shown(api: Api, machine: Machine, job: dict[str, Any]) -> None
     assert previews and all(event["data"]["step"] > 0 for event in previews)
 
 
+@pytest.mark.exhaustive
 def test_reconstruction_after_kills_gives_same_bytes(
     machine: Machine, scene: Path, undisturbed: Path, tmp_path: Path
 ) -> None:

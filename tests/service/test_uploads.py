@@ -342,6 +342,7 @@ def peak_kib(pid: int) -> int:
     raise AssertionError(pid)
 
 
+@pytest.mark.exhaustive
 def test_memory_does_not_grow_with_the_upload(
     start_server: Callable[[], tuple[int, Path]], record_property: Callable[[str, object], None]
 ) -> None:

@@ -305,6 +305,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
 """
 
 
+@pytest.mark.exhaustive
 def test_memory_does_not_grow_with_the_content(storage: Storage, s3_address: str) -> None:
     """In a process of its own, as the S3 server of the tests lives in this one."""
     if isinstance(storage, S3Storage):

@@ -64,6 +64,7 @@ def test_box_and_voxel_are_kept():
     assert edge_report(mesh.faces).open_edges > 50  # cut off by the box
 
 
+@pytest.mark.exhaustive
 def test_fusion_unbounded_covers_near_and_far():
     # Cameras inside a sphere 12 times as large as the ring that they stand on, a small ball in their midst.
     cameras = cameras_on_sphere(60, 1.0, 96, fov=70.0)

@@ -92,6 +92,7 @@ def test_true_depth_gives_the_true_surface(tmp_path):
     assert report.non_manifold_edges == report.inconsistent_edges == 0
 
 
+@pytest.mark.exhaustive
 @pytest.mark.heavy
 def test_reconstruction_comes_near_the_truth(tmp_path):
     _, cameras = scene_and_cameras(

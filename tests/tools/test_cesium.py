@@ -100,6 +100,7 @@ def placed_camera(pose: np.ndarray) -> list[list[float]]:
     return [values.tolist() for values in vectors]
 
 
+@pytest.mark.exhaustive
 def test_cesium_draws_tiles_on_the_earth_as_our_tracer_does(
     cesium: Path, scene: FlatGaussians, tmp_path: Path
 ) -> None:

@@ -83,6 +83,7 @@ def draw(
     return open_page(page, packages=spark, files={file.name: file}, width=SIDE_PX, height=SIDE_PX)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("name", "turn", "settings", "least_db"),
     [

@@ -67,6 +67,7 @@ def read(path: Path) -> GaussianCloud:
     return importer_for(path).read(path)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("name", "options"),
     [
@@ -125,6 +126,7 @@ def test_splat_transform_glb_is_read(convert: Convert, scene: FlatGaussians, tmp
     np.testing.assert_allclose(np.abs(np.sum(back.rotations[:, :, 0] * normals, axis=1)), 1, atol=1e-5)
 
 
+@pytest.mark.exhaustive
 def test_sog_is_written_through_it(
     program: Path, scene: FlatGaussians, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -145,6 +147,7 @@ def test_sog_is_written_through_it(
     assert np.degrees(np.arccos(np.clip(normals, -1, 1))).max() < 1.8  # components rounded down too
 
 
+@pytest.mark.exhaustive
 def test_levels_of_detail_are_written_through_it(
     program: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -219,6 +222,7 @@ window.result = (async () => {
 """
 
 
+@pytest.mark.exhaustive
 def test_playcanvas_shows_levels_of_detail(
     program: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

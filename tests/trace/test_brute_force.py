@@ -91,6 +91,7 @@ def assert_same_hits(gaussians: FlatGaussians, rays: RayBatch, *, steepest: floa
     return total
 
 
+@pytest.mark.exhaustive
 @pytest.mark.heavy
 def test_ten_thousand_rays_through_a_cloud(rng: np.random.Generator) -> None:
     cloud = make_cloud(rng, 3000)

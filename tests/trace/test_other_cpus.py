@@ -50,6 +50,7 @@ def trained(environment: dict[str, str]) -> str:
     return hashlib.sha256(done.stdout).hexdigest()
 
 
+@pytest.mark.exhaustive
 @pytest.mark.heavy
 def test_training_is_bit_identical_on_older_cpu() -> None:
     flags = Path("/proc/cpuinfo").read_text().split() if Path("/proc/cpuinfo").exists() else []

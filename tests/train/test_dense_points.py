@@ -84,6 +84,7 @@ def without_points_of_the_table(dataset: Dataset, folder: Path) -> tuple[Dataset
     return Dataset.open(folder / "scene", folder / "cache"), gone
 
 
+@pytest.mark.exhaustive
 def test_dense_points_cover_objects_without_sparse_points(
     dataset: Dataset, surface: cKDTree, tmp_path: Path
 ) -> None:
@@ -111,6 +112,7 @@ def test_dense_points_single_view_option_lifts_pixels(surface: cKDTree, tmp_path
     assert (off < 0.1).mean() > 0.6 and (off < 0.3).mean() > 0.75
 
 
+@pytest.mark.exhaustive
 def test_dense_matching_with_uneven_exposure(dataset: Dataset, tmp_path: Path) -> None:
     shutil.copytree(dataset.root, tmp_path / "scene")
     darker = np.where(np.arange(len(dataset.views)) % 3 == 1, 0.55, 1.0).astype(np.float32)

@@ -57,6 +57,7 @@ def measured(output: Path) -> tuple[dict, float]:
     return training, metrics["mean"]["psnr"]
 
 
+@pytest.mark.exhaustive
 def test_outlier_views_match_wrong_poses(scene: Path, tmp_path: Path) -> None:
     told = run(scene, tmp_path / "all")
     with_all, psnr = measured(tmp_path / "all")
@@ -105,6 +106,7 @@ def test_outlier_views_blockwise_matches_single_pass(monkeypatch: pytest.MonkeyP
     np.testing.assert_array_equal(find_outlier_views(fits, views, np.arange(count)), at_once)
 
 
+@pytest.mark.exhaustive
 def test_memory_grows_with_the_number_of_views_not_its_square() -> None:
     count = 5000
     views, psnr = views_of(count), np.full(count, 30.0)

@@ -195,6 +195,7 @@ def test_synthetic_scene_reaches_reference_psnr(tmp_path: Path) -> None:
     assert psnr > 20.5  # 21.0 when this was written
 
 
+@pytest.mark.exhaustive
 @pytest.mark.heavy
 @pytest.mark.real
 def test_real_scene_reaches_reference_psnr(scenes_root: Path, tmp_path: Path) -> None:

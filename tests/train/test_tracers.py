@@ -41,6 +41,7 @@ def train(folder: Path, tracer: str, iterations: int) -> tuple[TrainState, list[
     return trainer.state, events
 
 
+@pytest.mark.exhaustive
 def test_reference_tracer_trains_plane(tmp_path: Path) -> None:
     state, events = train(tmp_path, "reference", 110)
     held_out = [event.psnr for event in events if isinstance(event, HeldOutMeasured)]
@@ -64,6 +65,7 @@ def test_reference_tracer_first_steps_match_cpu_tracer(tmp_path: Path) -> None:
         assert far.mean() < 0.02, name
 
 
+@pytest.mark.exhaustive
 @pytest.mark.heavy
 def test_reference_tracer_trains_synthetic_scene(tmp_path: Path) -> None:
     root = tmp_path / "scene"

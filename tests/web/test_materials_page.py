@@ -65,6 +65,7 @@ def job(service: RunningService, folder: Path) -> str:
     return done.stdout.strip().splitlines()[-1]
 
 
+@pytest.mark.exhaustive
 def test_materials_page_offers_layers_relight_and_edit(
     service: RunningService, browse: Browse, folder: Path, job: str
 ) -> None:

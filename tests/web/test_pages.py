@@ -101,6 +101,7 @@ def work(flow: Flow, database: str) -> Iterator[None]:
     process.wait(120)
 
 
+@pytest.mark.exhaustive
 def test_upload_page_resumes_after_interruption(flow: Flow) -> None:
     facts = flow.facts
     assert facts["empty"] == "Nothing here yet"

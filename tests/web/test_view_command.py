@@ -48,6 +48,7 @@ def viewed(path: Path, *options: str) -> Iterator[tuple[subprocess.Popen[str], s
         process.communicate()
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("name", ["scene.ply", "scene.spz", "octagons.glb", "scene.splats.glb"])
 def test_view_serves_files_of_any_format_until_interrupted(
     scene: osp.Scene, tmp_path: Path, name: str

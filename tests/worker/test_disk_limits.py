@@ -21,6 +21,7 @@ def bench(conninfo: str, tmp_path: Path) -> Iterator[WorkerHarness]:
         bench.close()
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("floor_bytes", [0, 8 * MIB])
 def test_job_filling_disk_fails(bench: WorkerHarness, floor_bytes: int) -> None:
     bench.worker(FLOOR_BYTES=str(floor_bytes), FULL_DISK_SECONDS="0.1")
@@ -62,6 +63,7 @@ def test_workspace_beyond_limit_fails_job(bench: WorkerHarness) -> None:
     assert f"{4 * MIB} are allowed" in job.error["message"] and job.attempt == 1
 
 
+@pytest.mark.exhaustive
 def test_results_beyond_quota_fail_job(bench: WorkerHarness) -> None:
     bench.run_query(lambda connection: set_quota(connection, "me", Quota(max_bytes=MIB)))
     bench.worker()

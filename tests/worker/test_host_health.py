@@ -57,6 +57,7 @@ def test_broken_library_does_not_count_against_jobs(
     assert "the worker's machine is at fault" in bench.log(jobs[0]).lower()
 
 
+@pytest.mark.exhaustive
 def test_host_with_repeated_crashes_pauses(bench: WorkerHarness) -> None:
     bench.worker(RECOVER_SECONDS="0.4")
     crashing = [bench.submit(owner=owner, options={"crash_at": 1}) for owner in ("me", "you", "me")]

@@ -118,6 +118,7 @@ os.read(0, 1)
 """
 
 
+@pytest.mark.exhaustive
 def test_chains_of_processes_longer_than_the_stack_are_killed() -> None:
     with subprocess.Popen(
         [sys.executable, "-I", "-S", "-c", CHAIN, "60"], stdin=subprocess.PIPE, stdout=subprocess.PIPE

@@ -4,6 +4,7 @@ import uuid
 from itertools import pairwise
 
 import psutil
+import pytest
 
 from octasplat.workers.db.workers import live_workers
 from tests.support.worker_harness import MAX_WAIT_SECONDS, WorkerHarness
@@ -16,6 +17,7 @@ def attempts(bench: WorkerHarness, job_id: uuid.UUID) -> list[float]:
     return [(end.at - start.at).total_seconds() for start, end in pairs]
 
 
+@pytest.mark.exhaustive
 def test_job_time_limit_fails_and_retry_restarts_clock(bench: WorkerHarness) -> None:
     """The time counts over all attempts of a try."""
     hours = str(6 / 3600)

@@ -55,6 +55,7 @@ def frozen_database(bench: WorkerHarness) -> Iterator[None]:
             connection.execute(f'ALTER DATABASE "{name}" ALLOW_CONNECTIONS true')
 
 
+@pytest.mark.exhaustive
 def test_lost_database_stops_the_child_before_others_take_over(bench: WorkerHarness) -> None:
     worker = bench.worker(name="before", STALE_SECONDS=str(STALE_SECONDS))
     job_id = bench.submit(options=bench.wait_until_held())
@@ -101,6 +102,7 @@ def test_unresponsive_database_counts_as_lost(bench: WorkerHarness) -> None:
         wait_for_end(child, STALE_SECONDS)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("options", "settings", "type_"),
     [

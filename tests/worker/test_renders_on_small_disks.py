@@ -66,6 +66,7 @@ def submit_render(bench: WorkerHarness, scene: Path, disk_bytes: int) -> uuid.UU
     return bench.submit("render", source_id=source.id, options=options, estimate={"disk_bytes": disk_bytes})
 
 
+@pytest.mark.exhaustive
 def test_killed_render_goes_on_from_images_that_lie_on_disk_once(
     conninfo: str, tmp_path: Path, expected: dict[str, bytes]
 ) -> None:
@@ -84,6 +85,7 @@ def test_killed_render_goes_on_from_images_that_lie_on_disk_once(
         assert bench.results(job_id) == expected
 
 
+@pytest.mark.exhaustive
 def test_render_that_fills_disk_fails_and_lets_others_go_on(
     conninfo: str, tmp_path: Path, expected: dict[str, bytes]
 ) -> None:

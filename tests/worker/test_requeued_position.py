@@ -21,6 +21,7 @@ async def _starts(connection):  # type: ignore[no-untyped-def]
     return await cursor.fetchall()
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("kill", [False, True], ids=["planned restart", "kill"])
 def test_interrupted_job_keeps_queue_position(bench: WorkerHarness, kill: bool) -> None:
     worker = bench.worker(name="first")

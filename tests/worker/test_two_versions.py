@@ -90,6 +90,7 @@ def test_unknown_job_is_left_to_newer_worker(bench: WorkerHarness) -> None:
         assert (job.state, job.attempt, job.rescues, job.worker) == ("succeeded", 1, 0, "new")
 
 
+@pytest.mark.exhaustive
 def test_versions_with_other_results_are_not_mixed(bench: WorkerHarness) -> None:
     first = bench.worker(name="first")
     job_id = bench.submit(options=bench.wait_until_held())
