@@ -127,7 +127,8 @@ class SingleRayTracer:
 
     def _ray_query(self, function: int) -> EmbreeRayQuery:
         assert self._bvh is not None, "build first"
-        return EmbreeRayQuery(function, self._bvh.handle, self._scratch, self._arguments)
+        views = (self._scratch.view(kind) for kind in (np.int32, np.float64, np.uint64))
+        return EmbreeRayQuery(function, self._bvh.handle, self._scratch, *views, self._arguments)
 
 
 def _rays_per_chunk(ray_indices: Int64[np.ndarray, " s"]) -> int:

@@ -48,12 +48,16 @@ T_NEAR_SCALE, T_FAR_SCALE = np.float32(0.999999), np.float32(1.000001)
 class EmbreeRayQuery(NamedTuple):
     """Addresses of a function of Embree and of a scene; for each chunk of rays, a ray and arguments.
 
-    The columns of ``scratch`` are those of :mod:`octasplat.engine.trace.cpu.kernels.octagon_hit`.
+    The columns of ``scratch`` are those of :mod:`octasplat.engine.trace.cpu.kernels.octagon_hit`. The arrays
+    beside it are the same memory, viewed outside, as numba takes half a second to compile the views.
     """
 
     function: int
     scene: int
     scratch: Float32[np.ndarray, "c w"]
+    scratch_i32: Int32[np.ndarray, "c w"]
+    scratch_f64: Float64[np.ndarray, "c half"]
+    scratch_u64: UInt64[np.ndarray, "c half"]
     arguments: UInt64[np.ndarray, "c 8"]
 
 
@@ -68,10 +72,10 @@ def chunk_context(
     Float64[np.ndarray, " words"],
 ]:
     """Return the ray of a chunk and its context, as words of each type; the context has the records."""
-    ray = embree.scratch[chunk]
-    context = ray[RAY_WORDS:]
-    context.view(np.uint64)[PRIMITIVES_ADDRESS] = primitives.ctypes.data
-    return ray, ray.view(np.int32), context, context.view(np.int32), context.view(np.float64)
+    ray, ray_i32 = embree.scratch[chunk], embree.scratch_i32[chunk]
+    embree.scratch_u64[chunk, RAY_WORDS // 2 + PRIMITIVES_ADDRESS] = primitives.ctypes.data
+    context_f64 = embree.scratch_f64[chunk, RAY_WORDS // 2 :]
+    return ray, ray_i32, ray[RAY_WORDS:], ray_i32[RAY_WORDS:], context_f64
 
 
 @njit_no_refcount()
