@@ -12,6 +12,7 @@ from benchmarks.queue_simulation import Simulation, queue_roots, report
 pytestmark = pytest.mark.heavy
 
 
+@pytest.mark.exhaustive
 def test_blocks_without_work_survive_kills_of_their_workers(short_root: Path) -> None:
     server, conninfo = empty_database(short_root / "simulated")
     store = short_root / "store"

@@ -316,6 +316,7 @@ def large_scene(path: Path) -> int:
     return path.stat().st_size
 
 
+@pytest.mark.exhaustive
 def test_upload_goes_on_after_client_and_service_are_killed(conninfo: str, tmp_path: Path) -> None:
     scene = tmp_path / "scene.zip"
     size = large_scene(scene)

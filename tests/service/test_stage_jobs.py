@@ -218,6 +218,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.mark.exhaustive
 @pytest.mark.heavy
 async def test_killed_render_job_resumes_to_command_bytes(conninfo: str, tmp_path: Path, run: Path) -> None:
     from octasplat.workers.client.submission import Derivation, with_stage

@@ -319,6 +319,7 @@ def train(
     return model, state, [event.psnr for event in events if isinstance(event, HeldOutMeasured)]
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("recipe", "stop_after"), [("split_sum", 40), ("split_sum", 50), ("ref_gaussian", 50)]
 )

@@ -34,6 +34,7 @@ def test_addon_is_one_file_with_licence(tmp_path: Path) -> None:
     assert 'license = ["SPDX:Apache-2.0"]' in manifest and 'blender_version_min = "4.2.0"' in manifest
 
 
+@pytest.mark.exhaustive
 @pytest.mark.tools
 @pytest.mark.heavy
 def test_addon_opens_edits_and_saves_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

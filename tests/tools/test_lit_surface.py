@@ -109,6 +109,7 @@ def test_blender_has_the_same_triangles_and_tangents(
     assert (found["signs"] == tangents[:, 3]).mean() > 0.99
 
 
+@pytest.mark.exhaustive
 def test_lit_surface_matches_cycles_and_threejs(glb: Path, light: np.ndarray, tmp_path: Path) -> None:
     write_environment(tmp_path / "light.hdr", light)
     place = np.array([3.0, 3.0, 1.5])

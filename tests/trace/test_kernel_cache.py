@@ -197,6 +197,7 @@ def test_groups_of_requests() -> None:
     assert request_groups("render", options().model_copy(update={"stage": "stage.toml"})) == ("render-stage",)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.heavy
 def test_commands_call_no_kernels_beyond_the_table(tmp_path: Path) -> None:
     root = Path(__file__).parents[2]

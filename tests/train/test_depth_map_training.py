@@ -173,6 +173,7 @@ def test_stopped_training_with_maps_goes_on_to_the_same_bytes(measured_scene: Pa
     assert (resumed / "scene.ply").read_bytes() == (whole / "scene.ply").read_bytes()
 
 
+@pytest.mark.exhaustive
 def test_blocks_see_the_maps(measured_scene: Path, tmp_path: Path) -> None:
     run = reconstruct(measured_scene, tmp_path / "run", make_config(), blocks=BlockRequest(count=2))
     assert depth_error(measured_scene, run, tmp_path / "cache") < 0.05

@@ -65,6 +65,7 @@ class Wall(Dataset):
         return paint(self.origins[view][:, :2] + AWAY * ways), ones, ones
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("count", [20, 200])
 def test_pixels_are_lifted_onto_the_wall_however_long_it_is(count: int) -> None:
     wanted = 3 * count

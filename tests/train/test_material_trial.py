@@ -27,6 +27,7 @@ def few_pixels(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_tiny_dataset(tmp_path_factory, width_px=24, height_px=18)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.heavy
 def test_materials_of_matt_things_lose_accuracy(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
