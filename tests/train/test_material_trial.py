@@ -56,6 +56,7 @@ def test_long_training_with_useless_materials_is_warned_of(
     )
 
 
+@pytest.mark.exhaustive
 def test_time_of_the_trial_is_part_of_the_minutes(
     few_pixels: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

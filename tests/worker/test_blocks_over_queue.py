@@ -75,6 +75,7 @@ def check_results(bench: WorkerHarness, root: uuid.UUID, whole: Path) -> None:
     assert not any(name.startswith("blocks/") for name in results)
 
 
+@pytest.mark.exhaustive
 def test_one_worker_makes_the_bytes_of_one_process(
     bench: WorkerHarness, scene: Path, one_process: Path
 ) -> None:
@@ -85,6 +86,7 @@ def test_one_worker_makes_the_bytes_of_one_process(
     assert [child.attempt for child in blocks(bench, root)] == [1, 1] and bench.job(root).attempt == 2
 
 
+@pytest.mark.exhaustive
 def test_two_workers_of_which_one_is_killed_make_the_same_bytes(
     bench: WorkerHarness, scene: Path, one_process: Path
 ) -> None:
@@ -99,6 +101,7 @@ def test_two_workers_of_which_one_is_killed_make_the_same_bytes(
     check_results(bench, root, one_process)
 
 
+@pytest.mark.exhaustive
 def test_automatic_blocks_of_a_small_scene_are_no_blocks(bench: WorkerHarness, scene: Path) -> None:
     bench.worker()
     root = submit(bench, scene, blocks="auto")
@@ -107,6 +110,7 @@ def test_automatic_blocks_of_a_small_scene_are_no_blocks(bench: WorkerHarness, s
     assert "scene.ply" in bench.results(root)
 
 
+@pytest.mark.exhaustive
 def test_block_that_the_store_lost_fails_the_job_by_name(bench: WorkerHarness, scene: Path) -> None:
     bench.worker()
     root = submit(bench, scene, blocks=2)
