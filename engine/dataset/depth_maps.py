@@ -206,6 +206,8 @@ def open_depth_maps(
         OutputError: the cache cannot be written.
     """
     have_maps = [geometry is not None or view.depth_path is not None for view in model.views]
+    if geometry is not None:
+        digest = _digest_with_cameras(digest, model)
     index = _read_index(folder, digest, have_maps)
     if index is None:
         index = _decode(model, folder, digest, threads, geometry)
@@ -313,6 +315,16 @@ def _depth_ratios(
     in_map = maps.z_world(view, row, column, sizes)
     known = (in_map > 0) & (in_model > 0)
     return in_model[known] / in_map[known]
+
+
+def _digest_with_cameras(digest: str, model: DatasetModel) -> str:
+    """Return the digest of maps that are made of the geometry: as the cameras see it, which may be moved."""
+    total = hashlib.sha256(digest.encode())
+    for view in model.views:
+        if view.depth_path is None:
+            pose = np.column_stack([view.rotation_cam_from_world, view.translation_cam_from_world])
+            total.update(f"{view.name}\0{model.cameras[view.camera_index]}\0{pose.tolist()}\0".encode())
+    return total.hexdigest()
 
 
 class _Index(TypedDict):

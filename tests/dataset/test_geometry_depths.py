@@ -5,6 +5,7 @@ from pathlib import Path
 
 import laspy
 import numpy as np
+import pycolmap
 import pytest
 
 from octasplat.engine.core.errors import DatasetError
@@ -167,6 +168,23 @@ def test_geometry_elsewhere_is_refused(with_geometry: Path, tmp_path: Path) -> N
         (with_geometry / "geometry.obj").write_text("\n".join(lines) + "\n", encoding="utf-8")
         with pytest.raises(DatasetError, match=r"geometry\.obj .*coordinates of the poses"):
             open_dataset(with_geometry, tmp_path / f"cache{number}")
+
+
+def test_corrected_poses_give_other_distances(with_geometry: Path, tmp_path: Path) -> None:
+    before = open_dataset(with_geometry, tmp_path / "cache")
+    model = pycolmap.Reconstruction(str(load_dataset_model(with_geometry).model_folder))
+    moved = next(image for image in model.images.values() if image.name == before.views[0].name)
+    pose = moved.frame.rig_from_world
+    moved.frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, pose.translation + np.array([0, 0, 0.5]))
+    corrected = tmp_path / "corrected"
+    corrected.mkdir()
+    model.write(str(corrected))
+    geometry = find_known_geometry(with_geometry)
+    after = Dataset.open(with_geometry, tmp_path / "cache", geometry=geometry, model_folder=corrected)
+    fresh = Dataset.open(with_geometry, tmp_path / "fresh", geometry=geometry, model_folder=corrected)
+    np.testing.assert_array_equal(known_distances(after, 0), known_distances(fresh, 0))
+    assert not np.allclose(known_distances(before, 0), known_distances(fresh, 0), rtol=0.02)
+    assert before.views_record.depths_sha256 == after.views_record.depths_sha256  # of the files alone
 
 
 def test_changed_geometry_is_noticed(with_geometry: Path, tmp_path: Path) -> None:
