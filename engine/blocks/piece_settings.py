@@ -168,13 +168,15 @@ def finish_settings(config: TrainConfig, iterations: int) -> TrainConfig:
     begun = {name: getattr(lr, name) * lr.decay for name in DECAYING_RATES}
     rates = {**begun, "mean": lr.mean_final, "mean_final": config.lr.mean_final}
     rest = (config.shared_sort_until - FINISH_FROM) / (1 - FINISH_FROM)
+    # of 1 the last state is wanted
+    averaging_start = FINISH_AVERAGING_START if config.weight_averaging_start < 1 else 1.0
     return config.model_copy(
         update={
             "iterations": iterations,
             "densify_from_iter": iterations + 1,
             "early_stopping_db": 0.0,
             "shared_sort_until": max(0.0, rest),
-            "weight_averaging_start": FINISH_AVERAGING_START,
+            "weight_averaging_start": averaging_start,
             "lr": lr.model_copy(update={**rates, "decay": config.lr.decay / lr.decay, "scale_after": 0}),
         }
     )

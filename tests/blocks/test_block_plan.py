@@ -10,7 +10,12 @@ from click.testing import CliRunner
 
 from octasplat.__main__ import cli
 from octasplat.engine.blocks.block_map import SIDE_PX, draw_block_map
-from octasplat.engine.blocks.piece_settings import fewest_blocks
+from octasplat.engine.blocks.piece_settings import (
+    block_settings,
+    fewest_blocks,
+    finish_settings,
+    polish_settings,
+)
 from octasplat.engine.blocks.sparse_plan import plan_from_points
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.dataset import load_dataset_model
@@ -20,6 +25,7 @@ from octasplat.engine.operations.block_options import BlockOptions, parse_memory
 from octasplat.engine.operations.cost_model import estimate_reconstruction, gaussians_within
 from octasplat.engine.operations.plan import PlanRequest, run
 from octasplat.engine.runs.config import resolve_config
+from octasplat.engine.train.config import TrainConfig
 from tests.support.tiny_dataset import make_tiny_dataset
 
 
@@ -74,6 +80,17 @@ def test_number_of_blocks_grows_with_photographs_and_with_gaussians_that_do_not_
     assert [fewest_blocks(config, views, 10**9, None) for views in (10, 500, 501, 2000)] == [1, 1, 2, 4]
     assert fewest_blocks(config, 100, 10**9, 1_000_000) == 1
     assert fewest_blocks(config, 100, 10**9, 300_000) == 4
+
+
+def test_finish_averages_states_unless_the_settings_forbid_it() -> None:
+    default, last_state = TrainConfig(), TrainConfig(weight_averaging_start=1)
+    assert finish_settings(default, 100).weight_averaging_start == 0.5
+    for settings in (
+        block_settings(last_state, 0.5, None, is_finished_later=True),
+        polish_settings(last_state, 100),
+        finish_settings(last_state, 100),
+    ):
+        assert settings.weight_averaging_start == 1.0
 
 
 def test_gaussians_within_memory_are_those_of_its_estimate() -> None:
