@@ -20,7 +20,7 @@ from octasplat.engine.blocks.sparse_plan import plan_from_points
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.dataset import load_dataset_model
 from octasplat.engine.dataset.image_sizes import ImageSizes
-from octasplat.engine.operations.block_cost import estimate_with_blocks
+from octasplat.engine.operations.block_cost import BlockShare, estimate_blocks, estimate_with_blocks
 from octasplat.engine.operations.block_options import BlockOptions, parse_memory
 from octasplat.engine.operations.cost_model import estimate_reconstruction, gaussians_within
 from octasplat.engine.operations.plan import PlanRequest, run
@@ -156,6 +156,16 @@ def test_estimate_before_there_is_a_plan_counts_all_blocks() -> None:
     )
     bounded = estimate_with_blocks(config, BlockOptions(blocks=2, memory="1.2G"), photographs, 2)
     assert bounded.memory_bytes <= 1_200_000_000
+
+
+def test_block_that_fills_the_memory_is_estimated_to_take_it() -> None:
+    config = resolve_config("standard", assignments=["max_gaussians=20000000"]).with_poses_decided(True)
+    photographs = [ImageSizes(800, 600, 5000)]
+    most = gaussians_within(config, photographs, 4_000_000_000)
+    costs = estimate_blocks(config, photographs, [BlockShare(0.2, 900, 400_000_000)] * 6, most, 2)
+    # each block reads the model of all photographs
+    assert [cost.memory_bytes for cost in costs.blocks] == pytest.approx([4_000_000_000] * 6, rel=0.01)
+    assert costs.total.memory_bytes == pytest.approx(4_000_000_000, rel=0.01)
 
 
 def test_estimate_without_a_plan_is_near_that_of_the_plan(scene: Path) -> None:
