@@ -25,6 +25,8 @@ CONTROL_FILES = ("gcp_list.txt", "control_points.csv")
 """Names in the folder of a scene that need not be given."""
 MAX_BYTES = 10_000_000
 _COLUMNS = {"image": "photograph", "im_x": "px", "im_y": "py", "label": "name", "gcp_name": "name"}
+_PROJECTED_AMONG_DEGREES = frozenset((*range(4491, 4555), 4647))
+"""EPSG codes of projected systems in metres, of CGCS2000 and of Germany, among those that give degrees."""
 _UTM = re.compile(r"WGS ?84 UTM ?(?:zone )?([0-9]{1,2}) ?([NS])", re.IGNORECASE)
 _PROJ_UTM = re.compile(r"\+proj=utm .*\+zone=([0-9]{1,2})", re.IGNORECASE)
 
@@ -180,7 +182,7 @@ def _parse_crs(path: Path, text: str) -> str | None:
         code = int(found.group(1))
         if code in (4326, 4979):
             return WGS84
-        if 4000 <= code < 5000:
+        if 4000 <= code < 5000 and code not in _PROJECTED_AMONG_DEGREES:
             raise ConfigError(
                 f"{path}: EPSG:{code} gives no metres east and north; write the points in EPSG:4326 or in a "
                 "projected system, such as UTM."

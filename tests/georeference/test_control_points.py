@@ -8,6 +8,7 @@ import pytest
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.georeference import Georeference
 from octasplat.engine.dataset import load_dataset_model
+from octasplat.engine.georeference.control_file import read_control_file
 from octasplat.engine.georeference.find_georeference import find_georeference
 from octasplat.engine.georeference.request import read_request
 from tests.support.located_scene import (
@@ -59,6 +60,13 @@ def find(
 ) -> Georeference | None:
     request = read_request(scene, source, file, length)
     return find_georeference(open_scene(scene, tmp_path / "cache"), request, lambda _text: None)
+
+
+@pytest.mark.parametrize("code", ["EPSG:4549", "EPSG:4647"])
+def test_projected_systems_among_the_numbers_of_degrees_are_read(tmp_path: Path, code: str) -> None:
+    path = tmp_path / "gcp_list.txt"
+    path.write_text(f"{code}\n32691632.1 5334761.4 520.3 10 10 a.jpg a\n", encoding="utf-8")
+    assert read_control_file(path).crs == code
 
 
 @pytest.mark.parametrize("head", ["EPSG:32632", "WGS84 UTM 32N", "+proj=utm +zone=32 +datum=WGS84"])
