@@ -169,7 +169,13 @@ def test_files_outside_of_the_scene_or_missing_are_refused(scene, tmp_path, file
         find(scene, tmp_path, file)
 
 
-@pytest.mark.parametrize("length", ["a b", "a b -1", "a a 2", "a 'b 2", "a b nan", "nothing here 2"])
+@pytest.mark.parametrize(
+    "length",
+    [
+        "a b", "a b -1", "a a 2", "a 'b 2", "a b nan", "nothing here 2",
+        "inf,0,0 0,0,0 2", "0,nan,0 0,0,0 2", "1e200,0,0 0,0,0 2", "0,0,0 1,0,0 1e300",
+    ],
+)  # fmt: skip
 def test_bad_lengths_are_refused(scene, tmp_path, length):
     with pytest.raises(ConfigError, match="known_length"):
         find(scene, tmp_path, None, length)
