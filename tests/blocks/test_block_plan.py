@@ -82,6 +82,21 @@ def test_number_of_blocks_grows_with_photographs_and_with_gaussians_that_do_not_
     assert fewest_blocks(config, 100, 10**9, 300_000) == 4
 
 
+@pytest.mark.parametrize("length", [5_000, 20_000])
+def test_finish_takes_the_last_steps_of_the_blocks_first(length: int) -> None:
+    config = TrainConfig()
+    block = block_settings(config, 0.5, None, is_finished_later=True).lr.scaled_for(length)
+    finish = finish_settings(config, length, (length, 0, length)).lr.scaled_for(length)
+    assert finish.mean == pytest.approx(block.mean_final)
+    for name in ("quat", "log_scale", "opacity", "color"):
+        assert getattr(finish, name) == pytest.approx(block.decay * getattr(block, name)), name
+    whole = block_settings(config, 0.5, None, is_finished_later=False).lr.scaled_for(length)
+    polish = polish_settings(config, length, (length, 0, length)).lr.scaled_for(length)
+    assert (polish.mean, polish.decay) == (whole.mean_final, 1)
+    for name in ("quat", "log_scale", "opacity", "color"):
+        assert getattr(polish, name) == pytest.approx(whole.decay * getattr(whole, name)), name
+
+
 def test_finish_averages_states_unless_the_settings_forbid_it() -> None:
     default, last_state = TrainConfig(), TrainConfig(weight_averaging_start=1)
     assert finish_settings(default, 100).weight_averaging_start == 0.5
