@@ -1,6 +1,7 @@
 """A mesh or a cloud of points beside photographs gives them depths."""
 
 import shutil
+import struct
 from pathlib import Path
 
 import laspy
@@ -97,6 +98,36 @@ def test_laser_scan_is_read_in_full(tmp_path: Path, name: str) -> None:
     path.write_bytes(path.read_bytes()[:300])
     with pytest.raises(DatasetError, match=name):
         read_geometry(path)
+
+
+def test_damaged_laser_scans_are_refused_in_a_sentence(tmp_path: Path) -> None:
+    header = laspy.LasHeader(point_format=3, version="1.4")
+    scan = laspy.LasData(header)
+    scan.x, scan.y, scan.z = np.random.default_rng(2).uniform(0, 100, (3, 500))
+    for name in ("geometry.las", "geometry.laz"):
+        path = tmp_path / name
+        scan.write(path)
+        whole = path.read_bytes()
+        (begin,) = struct.unpack_from("<I", whole, 96)
+        damages = {
+            "records": (100, struct.pack("<I", 1 << 31)),
+            "extended records": (235, struct.pack("<QI", begin, 1 << 31)),
+            "scale": (131, struct.pack("<d", np.nan)),
+        }
+        if path.suffix == ".laz":
+            (table,) = struct.unpack_from("<q", whole, begin)
+            damages["compressed parts"] = (table + 4, struct.pack("<I", (1 << 32) - 1))
+            damages["place of their table"] = (begin, struct.pack("<q", 1 << 60))
+            damages["points of a part"] = (whole.index(b"laszip encoded") + 52 + 12, struct.pack("<I", 0))
+        for where, (place, value) in damages.items():
+            path.write_bytes(whole[:place] + value + whole[place + len(value) :])
+            with pytest.raises(DatasetError, match=name):
+                read_geometry(path)
+                pytest.fail(f"{where} of {name}")
+        for length in (3, 90, 110, 180, 240, 300, len(whole) - 20):
+            path.write_bytes(whole[:length])
+            with pytest.raises(DatasetError, match=name):
+                read_geometry(path)
 
 
 def test_geometry_is_a_part_of_a_scene() -> None:
