@@ -87,9 +87,11 @@ class ServiceSettings(WorkerSettings):
         max_body_bytes: length of any other request.
         quota_datasets: datasets that an owner may have.
         quota_jobs: jobs of an owner that may be queued or running.
-        max_iterations: ceiling of the iterations of a training; where they are not named, photographs
-            that are mostly transparent or masked take up to twice as many as is reckoned with.
-        max_gaussians: ceiling of the Gaussians of a scene.
+        max_iterations: ceiling of the iterations of a training, of each block in blocks; where they are not
+            named, photographs that are mostly transparent or masked take up to twice as many as is reckoned
+            with.
+        max_gaussians: ceiling of the Gaussians that a training may come to; a scene in blocks may come to so
+            many in each block, unless its options name a number for the whole.
         max_rays: ceiling of the rays of one iteration.
         max_side_px: ceiling of the longer side that photographs may be asked for.
         max_exports: ceiling of the files that one job writes in formats of its own.

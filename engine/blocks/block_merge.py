@@ -74,9 +74,9 @@ def finish_scene(work: BlockWork, plan: ScenePlan, tell: PieceProgress) -> Block
     merged = concatenate(cores)
     del cores
     if plan.is_finished_together:
-        finished = _finish(work, merged, coarse, tell, plan.last_iterations)
+        finished = _finish(work, plan, merged, coarse, tell)
     else:
-        finished = BestState(_polish(work, merged, is_near_cut, coarse, tell), coarse.shading)
+        finished = BestState(_polish(work, plan, merged, is_near_cut, coarse, tell), coarse.shading)
     pieces = [COARSE, *plan.block_names, plan.last_piece]
     shading = _final_shading(work, finished)
     return BlockScene(finished.gaussians, shading, {name: piece_record(work, name) for name in pieces})
@@ -106,7 +106,7 @@ def _limit_cores(config: TrainConfig, cores: Sequence[FlatGaussians]) -> list[Fl
 
 
 def _finish(
-    work: BlockWork, merged: FlatGaussians, coarse: BestState, tell: PieceProgress, iterations: int
+    work: BlockWork, plan: ScenePlan, merged: FlatGaussians, coarse: BestState, tell: PieceProgress
 ) -> BestState:
     """Return the scene of which all Gaussians, exposures and the background went on together to the end."""
 
@@ -116,12 +116,14 @@ def _finish(
         state.shading = dict(coarse.shading)
         return state
 
-    piece = Piece(FINISH, work.dataset, finish_settings(work.config, iterations), start)
+    config = finish_settings(work.config, plan.last_iterations, plan.iterations)
+    piece = Piece(FINISH, work.dataset, config, start)
     return train_piece(work, piece, tell.of_piece(FINISH))
 
 
 def _polish(
     work: BlockWork,
+    plan: ScenePlan,
     merged: FlatGaussians,
     is_near_cut: Bool[np.ndarray, " n"],
     coarse: BestState,
@@ -138,7 +140,7 @@ def _polish(
         return merged
     data = BlockDataset(work.dataset, pixels)
     iterations = polish_iterations(work.config, pixels.drawn_pixel_count, valid_pixel_fraction(data))
-    config = polish_settings(work.config, iterations)
+    config = polish_settings(work.config, iterations, plan.iterations)
 
     def start() -> TrainState:
         work.progress(Noted(f"The {int(is_near_cut.sum())} Gaussians near to cuts are trained together."))

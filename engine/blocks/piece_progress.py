@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+from octasplat.engine.blocks.scene_plan import FINISH
 from octasplat.engine.core.events import (
     CheckpointWritten,
     Event,
@@ -38,7 +39,13 @@ class PieceProgress:
 
         def listen(event: Event) -> None:
             if isinstance(event, HeldOutMeasured):
-                return  # of the coarse scene alone, at another size
+                if name != FINISH:
+                    return  # of the coarse scene alone, at another size
+                event = replace(
+                    event,
+                    iteration=self._iterations_before(name) + event.iteration,
+                    seconds=self._seconds_before(name) + event.seconds,
+                )
             if isinstance(event, TrainingProgress):
                 event = self._translate(name, event)
             elif isinstance(event, CheckpointWritten):
@@ -51,6 +58,10 @@ class PieceProgress:
         names = list(self._iterations)
         return sum(self._iterations[other] for other in names[: names.index(name)])
 
+    def _seconds_before(self, name: str) -> float:
+        last_name, last_seconds = self._last
+        return self._seconds_done + (last_seconds if last_name != name else 0.0)
+
     def _translate(self, name: str, event: TrainingProgress) -> TrainingProgress:
         """Return the progress of a piece as that of all."""
         names = list(self._iterations)
@@ -59,8 +70,7 @@ class PieceProgress:
         before, after = self._iterations_before(name), sum(counts[place + 1 :])
         left_here = event.total_iterations - event.iteration
         pace_s = event.seconds_left / left_here if left_here else event.seconds / max(event.iteration, 1)
-        if self._last[0] != name:
-            self._seconds_done += self._last[1]
+        self._seconds_done = self._seconds_before(name)
         self._last = (name, event.seconds)
         return replace(
             event,

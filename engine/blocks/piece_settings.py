@@ -5,7 +5,13 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.train.config import McmcConfig, TrainConfig, max_gaussian_count, uses_shared_sort
+from octasplat.engine.train.config import (
+    LearningRates,
+    McmcConfig,
+    TrainConfig,
+    max_gaussian_count,
+    uses_shared_sort,
+)
 
 if TYPE_CHECKING:
     from octasplat.engine.runs.config import ReconstructionConfig
@@ -158,23 +164,30 @@ def fits_together(
     return expected <= (most_gaussians or config.max_gaussians or config.max_gaussians_auto)
 
 
-def finish_settings(config: TrainConfig, iterations: int) -> TrainConfig:
+def finish_settings(config: TrainConfig, iterations: int, of_blocks: Sequence[int] = ()) -> TrainConfig:
     """Return the settings of finishing all blocks together: the rest of the schedule that they began.
 
     Nothing is added or moved elsewhere any more. Exposures and background are learnt again.
+
+    Args:
+        config: of the run.
+        iterations: of the finish.
+        of_blocks: iterations of each block; 0 of those that are not trained.
     """
-    lr = _first_part(config).lr
+    lr = _rates_of_blocks(_first_part(config), of_blocks)
     # each rate goes on from where the blocks' has ended
     begun = {name: getattr(lr, name) * lr.decay for name in DECAYING_RATES}
     rates = {**begun, "mean": lr.mean_final, "mean_final": config.lr.mean_final}
     rest = (config.shared_sort_until - FINISH_FROM) / (1 - FINISH_FROM)
+    # of 1 the last state is wanted
+    averaging_start = FINISH_AVERAGING_START if config.weight_averaging_start < 1 else 1.0
     return config.model_copy(
         update={
             "iterations": iterations,
             "densify_from_iter": iterations + 1,
             "early_stopping_db": 0.0,
             "shared_sort_until": max(0.0, rest),
-            "weight_averaging_start": FINISH_AVERAGING_START,
+            "weight_averaging_start": averaging_start,
             "lr": lr.model_copy(update={**rates, "decay": config.lr.decay / lr.decay, "scale_after": 0}),
         }
     )
@@ -201,9 +214,21 @@ def _first_part(config: TrainConfig) -> TrainConfig:
     )
 
 
-def polish_settings(config: TrainConfig, iterations: int) -> TrainConfig:
-    """Return the settings of the polish: the last, small steps, and nothing is added or moved elsewhere."""
-    lr = config.lr
+def _rates_of_blocks(config: TrainConfig, of_blocks: Sequence[int]) -> LearningRates:
+    """Return the rates that blocks of so many iterations had in the mean: those of long ones are smaller."""
+    trained = [length for length in of_blocks if length]
+    return config.lr.scaled_for(round(sum(trained) / max(len(trained), 1)))
+
+
+def polish_settings(config: TrainConfig, iterations: int, of_blocks: Sequence[int] = ()) -> TrainConfig:
+    """Return the settings of the polish: the last, small steps, and nothing is added or moved elsewhere.
+
+    Args:
+        config: of the run.
+        iterations: of the polish.
+        of_blocks: iterations of each block; 0 of those that are not trained.
+    """
+    lr = _rates_of_blocks(config, of_blocks)
     last = {name: getattr(lr, name) * lr.decay for name in ("quat", "log_scale", "opacity", "color")}
     rates = {**last, "mean": lr.mean_final, "decay": 1.0, "exposure": 0.0, "background": 0.0}
     return config.model_copy(
@@ -211,6 +236,6 @@ def polish_settings(config: TrainConfig, iterations: int) -> TrainConfig:
             "iterations": iterations,
             "densify_from_iter": iterations + 1,
             "early_stopping_db": 0.0,
-            "lr": lr.model_copy(update=rates),
+            "lr": lr.model_copy(update={**rates, "scale_after": 0}),
         }
     )

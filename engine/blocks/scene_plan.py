@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 
@@ -12,10 +11,10 @@ from octasplat.engine.blocks.partition import Box
 from octasplat.engine.core.errors import CheckpointError
 from octasplat.engine.core.writing import atomic_replace
 from octasplat.engine.dataset.view_tiles import Rectangles
+from octasplat.engine.train.loop.checkpoint import ARCHIVE_DAMAGE
 
 PLAN_FILE = "plan.npz"
 COARSE, POLISH, FINISH = "coarse", "polish", "finish"
-_DAMAGE = (OSError, ValueError, KeyError, IndexError, EOFError, BadZipFile)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,5 +121,5 @@ def load_plan(folder: Path) -> ScenePlan:
         return ScenePlan(
             blocks, tuple(found["iterations"].tolist()), coarse, last, most or None, bool(together)
         )
-    except _DAMAGE as error:
+    except (*ARCHIVE_DAMAGE, IndexError) as error:
         raise CheckpointError(f"{path} cannot be read ({error}); train again without --resume.") from None

@@ -279,6 +279,8 @@ def _ascii_table(path: Path, handle: IO[bytes], element: PlyElement) -> np.ndarr
             f"but its properties ask for {place}."
         )
     table = np.zeros(len(values), dtype=element.dtype("=", lengths))
+    if len(values) == 0:  # which has no columns either
+        return table
     place = 0
     with np.errstate(over="ignore", invalid="ignore"):
         for prop in element.properties:

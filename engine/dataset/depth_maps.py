@@ -28,13 +28,14 @@ import OpenImageIO as oiio
 from jaxtyping import Bool, Float32, Float64, Int64
 
 from octasplat.engine.core.errors import DatasetError
+from octasplat.engine.core.read_ahead import read_ahead
 from octasplat.engine.core.relative_paths import normalize_name
 from octasplat.engine.core.scene_layout import DEPTH_FOLDERS, IMAGE_SUFFIXES
 from octasplat.engine.core.writing import atomic_replace, write_json
 from octasplat.engine.dataset.images import open_image, read_pixels
-from octasplat.engine.dataset.known_geometry import GeometryDepths, KnownGeometry
+from octasplat.engine.dataset.known_geometry import GeometryDepths, KnownGeometry, digest_with_cameras
 from octasplat.engine.dataset.mapped_array import MappedArray
-from octasplat.engine.dataset.model import DatasetModel
+from octasplat.engine.dataset.model import DatasetModel, Viewpoints
 from octasplat.engine.dataset.pixel_cache import file_sha256
 
 CACHE_VERSION = 4
@@ -206,6 +207,9 @@ def open_depth_maps(
         OutputError: the cache cannot be written.
     """
     have_maps = [geometry is not None or view.depth_path is not None for view in model.views]
+    if geometry is not None:
+        seeing = tuple(view for view in model.views if view.depth_path is None)
+        digest = digest_with_cameras(digest, Viewpoints(seeing, model.cameras))
     index = _read_index(folder, digest, have_maps)
     if index is None:
         index = _decode(model, folder, digest, threads, geometry)
@@ -315,6 +319,10 @@ def _depth_ratios(
     return in_model[known] / in_map[known]
 
 
+def _read_if_there(path: Path | None) -> tuple[Float32[np.ndarray, "h w"], bool] | None:
+    return None if path is None else read_depth_map(path)
+
+
 class _Index(TypedDict):
     version: int
     digest: str
@@ -345,8 +353,9 @@ def _decode(
     sizes_px: list[list[int]] = []
     are_integers: list[bool] = []
     have_depths: list[bool] = []
+    workers = threads or os.cpu_count() or 1
     with (
-        ThreadPoolExecutor(threads if threads > 0 else os.cpu_count() or 1) as pool,
+        ThreadPoolExecutor(workers) as pool,
         atomic_replace(folder / _VALUES) as path,
         path.open("wb") as file,
     ):
@@ -354,7 +363,7 @@ def _decode(
         if geometry is not None:
             of_geometry = GeometryDepths(geometry.read().about(model.origin_world), threads)
         paths = (view.depth_path for view in model.views)
-        decoded = pool.map(lambda path: None if path is None else read_depth_map(path), paths)
+        decoded = read_ahead(_read_if_there, paths, pool, 2 * workers)
         for view, found in zip(model.views, decoded, strict=True):
             depth, is_integer = (np.zeros((0, 0), np.float32), False) if found is None else found
             if found is not None:

@@ -12,6 +12,7 @@ from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from octasplat.engine.core.color import linear_to_srgb
 from octasplat.engine.core.errors import DatasetError
+from octasplat.engine.core.image_messages import image_message
 from octasplat.engine.core.threads import limit_torch_threads
 from octasplat.engine.dataset.image_info import ImageInfo, Storage
 
@@ -155,7 +156,7 @@ def open_image(path: Path) -> tuple[Any, Any]:
     wish.attribute("oiio:UnassociatedAlpha", 1)
     source = oiio.ImageInput.open(str(path), wish)
     if source is None:
-        reason = _single_line_message(oiio.geterror(), path)
+        reason = _single_line_message(image_message(oiio), path)
         raise DatasetError(f"{path} cannot be read as an image{reason}; replace the file.")
     return source, source.spec()
 
@@ -167,7 +168,7 @@ def read_pixels(source: Any, path: Path, kind: str) -> Pixels:
         DatasetError: the file is damaged or cut short.
     """
     pixels = source.read_image(kind)
-    message = source.geterror()
+    message = image_message(source)
     source.close()
     # A JPEG that ends early is filled up with gray and only this message tells.
     if pixels is None or "premature end" in message.lower():

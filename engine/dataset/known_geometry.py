@@ -8,6 +8,7 @@ first meets the mesh. Points get a square each, as large as their distance from 
 points hide far ones; a depth counts where a ray passes close to the point itself.
 """
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,7 @@ from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.dataset.camera import Camera
-from octasplat.engine.dataset.model import PosedView
+from octasplat.engine.dataset.model import PosedView, Viewpoints
 from octasplat.engine.geometry.imported_mesh import ImportedMesh
 
 MAX_SIDE_PX = 800
@@ -98,6 +99,15 @@ class GeometryDepths:
         z[known] = hits.distances[known] * directions[known, 2]
         depth[is_ray] = np.maximum(z, 0.0)
         return depth.reshape(height, width)
+
+
+def digest_with_cameras(digest: str, viewpoints: Viewpoints) -> str:
+    """Return a digest of the geometry as cameras see it, which may be moved, from one of the geometry."""
+    total = hashlib.sha256(digest.encode())
+    for view in viewpoints.views:
+        pose = np.column_stack([view.rotation_cam_from_world, view.translation_cam_from_world])
+        total.update(f"{view.name}\0{viewpoints.cameras[view.camera_index]}\0{pose.tolist()}\0".encode())
+    return total.hexdigest()
 
 
 def map_size(width_px: int, height_px: int) -> tuple[int, int]:

@@ -16,6 +16,7 @@ from jaxtyping import Float32, UInt8
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.core.image_messages import image_message
 from octasplat.engine.core.writing import atomic_replace
 from octasplat.engine.files.encodings import SQRT_HALF, from_smallest_three, logits_from_bytes
 from octasplat.engine.files.export_options import ExportOptions
@@ -124,11 +125,11 @@ def _rgba_pixels(path: Path, name: str, image: Path) -> UInt8[np.ndarray, "h w 4
     as_stored["oiio:UnassociatedAlpha"] = 1
     source = oiio.ImageInput.open(str(image), as_stored)
     if source is None:
-        raise SceneFileError(f"{path}: its image {name} cannot be read ({oiio.geterror()}).")
+        raise SceneFileError(f"{path}: its image {name} cannot be read ({image_message(oiio)}).")
     try:
         pixels = source.read_image(format=oiio.UINT8)
         if pixels is None:
-            raise SceneFileError(f"{path}: its image {name} is damaged ({source.geterror()}).")
+            raise SceneFileError(f"{path}: its image {name} is damaged ({image_message(source)}).")
     finally:
         source.close()
     if pixels.shape[2] < 3:

@@ -35,7 +35,8 @@ from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 
 MESH, MATERIAL = f"{ROOT}/surface", f"{ROOT}/materials/surface"
 ALIGNMENT = 64
-MAX_BYTES = (1 << 32) - 1
+MAX_BYTES = 2_000_000_000
+"""Of all entries: near 2 GiB the zip file would get records of ZIP64, which USD does not read."""
 _HEADER_BYTES, _EXTRA_HEADER_BYTES = 30, 4
 _PADDING_ID = 0x1986
 """Of the extra field that fills a header up; the one that USD's own tools write."""
@@ -54,7 +55,7 @@ def write_surface(
             is the one of its light, and a georeference knows up itself.
 
     Raises:
-        SceneFileError: usd-core is missing, or more than the 4 GiB that a package can hold.
+        SceneFileError: usd-core is missing, or more than the 2 GB that a package can hold.
         OSError: the file cannot be written.
     """
     pxr = import_usd(path, _MODULES)
@@ -66,21 +67,21 @@ def write_surface(
             textures["normals.png"] = mesh.materials.normals
     entries = [("surface.usdc", _layer(pxr, mesh, turn_xyzw))]
     entries += [(name, png_bytes(pixels)) for name, pixels in textures.items()]
-    package = _package(entries)
-    if len(package) > MAX_BYTES:
+    needed = sum(len(data) for _, data in entries)
+    if needed > MAX_BYTES:
         raise SceneFileError(
-            f"{path}: not written; the surface needs {len(package):,} bytes, and a USDZ holds at most "
+            f"{path}: not written; the surface needs {needed:,} bytes, and a USDZ of ours holds at most "
             f"{MAX_BYTES:,}. Decimate it with --max-triangles, or name a .ply."
         )
     with atomic_replace(path) as temporary:
-        temporary.write_bytes(package)
+        temporary.write_bytes(_package(entries))
     return (path,)
 
 
 def _package(entries: Sequence[tuple[str, bytes]]) -> bytes:
     """Return a zip file as USDZ wants it; the same entries give the same bytes."""
     buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED, allowZip64=False) as archive:
         for name, data in entries:
             header = zipfile.ZipInfo(name)  # of a fixed date
             begin = buffer.tell() + _HEADER_BYTES + len(name.encode()) + _EXTRA_HEADER_BYTES

@@ -25,6 +25,8 @@ CONTROL_FILES = ("gcp_list.txt", "control_points.csv")
 """Names in the folder of a scene that need not be given."""
 MAX_BYTES = 10_000_000
 _COLUMNS = {"image": "photograph", "im_x": "px", "im_y": "py", "label": "name", "gcp_name": "name"}
+_PROJECTED_AMONG_DEGREES = frozenset((*range(4491, 4555), 4647))
+"""EPSG codes of projected systems in metres, of CGCS2000 and of Germany, among those that give degrees."""
 _UTM = re.compile(r"WGS ?84 UTM ?(?:zone )?([0-9]{1,2}) ?([NS])", re.IGNORECASE)
 _PROJ_UTM = re.compile(r"\+proj=utm .*\+zone=([0-9]{1,2})", re.IGNORECASE)
 
@@ -115,7 +117,10 @@ def _csv_names(line: str) -> list[str]:
 def _csv_rows(path: Path, content: list[tuple[int, str]]) -> Iterator[tuple[int, Mapping[str, str]]]:
     names = _csv_names(content[0][1])
     for number, line in content[1:]:
-        values = [value.strip() for value in next(csv.reader([line]))]
+        try:
+            values = [value.strip() for value in next(csv.reader([line]))]
+        except csv.Error as error:
+            raise ConfigError(f"{path}, line {number}: cannot be read ({error}).") from None
         if len(values) > len(names):
             raise ConfigError(f"{path}, line {number}: has {len(values)} values for {len(names)} columns.")
         yield number, dict(zip(names, values, strict=False))
@@ -180,16 +185,19 @@ def _parse_crs(path: Path, text: str) -> str | None:
         code = int(found.group(1))
         if code in (4326, 4979):
             return WGS84
-        if 4000 <= code < 5000:
+        if 4000 <= code < 5000 and code not in _PROJECTED_AMONG_DEGREES:
             raise ConfigError(
                 f"{path}: EPSG:{code} gives no metres east and north; write the points in EPSG:4326 or in a "
                 "projected system, such as UTM."
             )
         return f"EPSG:{code}"
-    if utm := _UTM.search(text):
-        return f"EPSG:{32600 + 100 * (utm.group(2).upper() == 'S') + int(utm.group(1))}"
-    if utm := _PROJ_UTM.search(text):
-        return f"EPSG:{32600 + 100 * ('+south' in text) + int(utm.group(1))}"
+    utm, is_south = _UTM.search(text), "+south" in text
+    if utm is not None:
+        is_south = utm.group(2).upper() == "S"
+    else:
+        utm = _PROJ_UTM.search(text)
+    if utm is not None and 1 <= int(utm.group(1)) <= 60:
+        return f"EPSG:{32600 + 100 * is_south + int(utm.group(1))}"
     if "+proj=longlat" in text or text.strip().upper() in ("WGS84", "WGS 84"):
         return WGS84
     if text.strip().lower() in ("", "local"):

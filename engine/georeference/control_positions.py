@@ -125,4 +125,5 @@ def _coordinates(text: str) -> _Position | None:
         x, y, z = (float(part) for part in text.split(","))
     except ValueError:
         return None
-    return np.array([x, y, z])
+    position = np.array([x, y, z])
+    return position if np.isfinite(position).all() else None

@@ -1,5 +1,6 @@
 """The georeference of a scene with poses, from control points, GPS, or a known length."""
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,6 +22,8 @@ GPS_TOLERANCE, GPS_MAX_TOLERANCE_M = 0.2, 10.0
 """GPS positions may be so far off and still agree: as a share of their spread, and in metres."""
 CONTROL_TOLERANCE = 0.05
 """The same of control points."""
+MAX_SCALE = 1e12
+"""Metres that a unit of a scene may have, and units that a metre may have, by a known length."""
 _Positions = Float64[np.ndarray, "n 3"]
 
 
@@ -157,11 +160,16 @@ def _with_length(
 ) -> Georeference:
     """Return a georeference in which a length is as known; position and turn are those of ``found``."""
     first, second = (points.end_of_length(name) for name in length.ends)
-    units = float(np.linalg.norm(second - first))
+    units = math.dist(first, second)
     centres = points.camera_centres()
     if not units > 1e-9 * float(np.linalg.norm(np.ptp(centres, axis=0))):
         raise ConfigError(f"known_length: {' and '.join(length.ends)} are in one place; name other points.")
     scale, middle = length.metres / units, np.median(centres, axis=0)
+    if not 1 / MAX_SCALE < scale < MAX_SCALE:
+        raise ConfigError(
+            f"known_length: {length.metres:g} m between {' and '.join(length.ends)} would make one unit of "
+            f"the scene {scale:g} m; correct the length or its ends."
+        )
     matrix = np.eye(4)
     if found is None:
         matrix[:3, :3] = scale * _level_frame(estimate_up(_rotations(dataset)))

@@ -32,18 +32,26 @@ def read_gps(path: Path) -> GpsPosition | None:
         ValueError,
         ZeroDivisionError,
         SyntaxError,
+        RuntimeError,  # of the library that reads AVIF
         Image.DecompressionBombError,
     ):
         return None
-    if tags.get(ExifTags.GPS.GPSAltitudeRef, b"\0") in (1, b"\1"):
-        height = -height  # below the sea
+    if tags.get(ExifTags.GPS.GPSAltitudeRef, b"\0") in (1, 3, b"\1", b"\3"):
+        height = -height  # below the sea, or below the ellipsoid; EXIF 3.0 tells these apart
     if not (abs(latitude) <= 90 and abs(longitude) <= 180 and math.isfinite(height)):
         return None
     return None if latitude == longitude == 0 else (latitude, longitude, height)
 
 
-def _degrees(parts: Sequence[Any], letter: str, letters: str) -> float:
-    """Return an angle of degrees, minutes and seconds; ``letters`` are the negative and the positive one."""
+def _degrees(parts: Sequence[Any], reference: Any, letters: str) -> float:
+    """Return an angle of degrees, minutes and seconds; ``letters`` are the negative and the positive one.
+
+    Raises:
+        ValueError: the reference is none of the letters: on which side of zero the angle is stays open.
+    """
     degrees, minutes, seconds = (float(part) for part in parts)
-    sign = (-1.0, 1.0)[letters.index(letter.strip("\0 ").upper())]
+    letter = reference.strip("\0 ").upper() if isinstance(reference, str) else ""
+    if letter not in tuple(letters):
+        raise ValueError(f"{reference!r} is none of {letters}")
+    sign = -1.0 if letter == letters[0] else 1.0
     return sign * (degrees + minutes / 60 + seconds / 3600)

@@ -27,6 +27,7 @@ from octasplat.engine.operations.cost_model import (
     estimate_reconstruction,
     gaussians_within,
     held_out_count,
+    model_bytes,
     training_pixels,
 )
 from octasplat.engine.train.config import max_gaussian_count
@@ -89,7 +90,11 @@ def estimate_blocks(
     )
     coarse = estimate_reconstruction(smaller, photographs, cores)
     # Blocks that are alike, as thousands of an even guess, are reckoned once.
-    found = {block: _estimate_block(config, block, most_gaussians, cores) for block in dict.fromkeys(shares)}
+    total_count = sum(sizes.count for sizes in photographs)
+    found = {
+        block: _estimate_block(config, block, most_gaussians, cores, total_count)
+        for block in dict.fromkeys(shares)
+    }
     costs, counts = zip(*(found[block] for block in shares), strict=True)
     block_seconds = [cost.stage_seconds["train"] for cost in costs]
     block_bytes = [cost.memory_bytes for cost in costs]
@@ -112,15 +117,24 @@ def estimate_blocks(
 
 
 def _estimate_block(
-    config: "ReconstructionConfig", block: BlockShare, most_gaussians: int | None, cores: int
+    config: "ReconstructionConfig",
+    block: BlockShare,
+    most_gaussians: int | None,
+    cores: int,
+    photograph_count: int,
 ) -> tuple[Estimate, int]:
-    """Return the estimate of the training of a block by itself, and its most Gaussians."""
+    """Return the estimate of the training of a block by itself, and its most Gaussians.
+
+    It reads the model of all photographs, whichever show the block.
+    """
     train = block_settings(config.train, block.share, most_gaussians, is_finished_later=False)
     # as photographs of which all are trained on and all pixels show the block
     views = max(block.view_count, 1)
     side = max(1, round((block.drawn_pixel_count / views) ** 0.5))
     alone = config.model_copy(update={"train": train, "held_out": (), "max_side": None})
     cost = estimate_reconstruction(alone, [ImageSizes(side, side, views)], cores)
+    others = model_bytes(max(0, photograph_count - views))
+    cost = cost.model_copy(update={"memory_bytes": cost.memory_bytes + others})
     return cost, max_gaussian_count(train, block.drawn_pixel_count)
 
 

@@ -169,7 +169,7 @@ def estimate_reconstruction(
     if materials:
         # the largest of both phases: they follow each other
         training = max(training + _MATERIAL_TRAIN_BYTES, _MATERIAL_START_BYTES)
-    memory = _START_BYTES + _MODEL_BYTES_PER_PHOTOGRAPH * count + max(training, _PIXEL_BYTES * largest)
+    memory = _START_BYTES + model_bytes(count) + max(training, _PIXEL_BYTES * largest)
     disk = reconstruction_bytes(options, photographs)
     found = _make_estimate(
         cpu_seconds, memory, cores, finds_poses=finds_poses, disk_bytes=disk, stages=stages
@@ -185,11 +185,16 @@ def gaussians_within(
     train = options.train
     shrunk = [capped_sizes(sizes, options.max_side) for sizes in photographs]
     largest = max((sizes.width_px * sizes.height_px for sizes in shrunk), default=0)
-    start = _START_BYTES + _MODEL_BYTES_PER_PHOTOGRAPH * sum(sizes.count for sizes in shrunk)
+    start = _START_BYTES + model_bytes(sum(sizes.count for sizes in shrunk))
     if memory_bytes < start + _PIXEL_BYTES * largest:
         return 0
     left = memory_bytes - start - _RAY_BYTES * max(train.rays_per_batch, train.probe_rays)
     return max(0, left // _gaussian_bytes(train.sh_degree))
+
+
+def model_bytes(photographs: int) -> int:
+    """Return the memory that the model of so many photographs takes while it is read."""
+    return _MODEL_BYTES_PER_PHOTOGRAPH * photographs
 
 
 def _pose_search_cpu_seconds(photographs: Sequence[ImageSizes]) -> dict[str, float]:

@@ -14,6 +14,7 @@ from jaxtyping import Float32
 
 from octasplat.engine.core.color import srgb_to_linear, to_bytes
 from octasplat.engine.core.errors import DatasetError, OutputError
+from octasplat.engine.core.image_messages import image_message
 from octasplat.engine.core.writing import atomic_replace
 
 _RAW_CONFIG = "oiio:UnassociatedAlpha"
@@ -148,12 +149,12 @@ def read_image(path: Path) -> Float32[np.ndarray, "h w c"]:
     config.attribute(_RAW_CONFIG, 1)
     source = oiio.ImageInput.open(str(path), config)
     if source is None:
-        raise DatasetError(f"Cannot read {path} as an image: {oiio.geterror()}.")
+        raise DatasetError(f"Cannot read {path} as an image: {image_message(oiio)}.")
     try:
         spec = source.spec()
         pixels = source.read_image(0, 0, 0, spec.nchannels, oiio.FLOAT)
         if pixels is None:
-            raise DatasetError(f"The image {path} is damaged: {source.geterror()}.")
+            raise DatasetError(f"The image {path} is damaged: {image_message(source)}.")
         shape = (spec.height, spec.width, spec.nchannels)
         return np.asarray(pixels, dtype=np.float32).reshape(shape)
     finally:
@@ -180,10 +181,10 @@ def _write(path: Path, spec: Any, pixels: np.ndarray) -> None:
         with atomic_replace(path) as temporary:
             output = oiio.ImageOutput.create(str(temporary))
             if output is None:
-                raise OutputError(f"Cannot write {path}: {oiio.geterror() or 'unknown image format'}.")
+                raise OutputError(f"Cannot write {path}: {image_message(oiio) or 'unknown image format'}.")
             # close() is the last step that can fail: some formats write only then.
             done = output.open(str(temporary), spec) and output.write_image(np.ascontiguousarray(pixels))
             if not (output.close() and done):
-                raise OutputError(f"Cannot write {path}: {output.geterror() or 'the disk may be full'}.")
+                raise OutputError(f"Cannot write {path}: {image_message(output) or 'the disk may be full'}.")
     except OSError as error:
         raise OutputError(f"Cannot write {path}: {error.strerror or error}.") from error

@@ -82,7 +82,14 @@ def test_plan_is_read_as_it_was_written(scene: Path, tmp_path: Path) -> None:
     assert plan.expected_iterations()["coarse"] == 20
     assert all(block.pixels.pixel_count > 0 for block in plan.blocks)
     path = run / "blocks" / "plan.npz"
-    path.write_bytes(path.read_bytes()[:200])
+    whole = path.read_bytes()
+    # a flipped bit asks for a password, or for a zip file of the future
+    for offset, value in ((8, 1), (6, 99)):
+        place = whole.index(b"PK\x01\x02") + offset
+        path.write_bytes(whole[:place] + bytes([value]) + whole[place + 1 :])
+        with pytest.raises(CheckpointError, match=r"plan\.npz cannot be read"):
+            load_plan(run / "blocks")
+    path.write_bytes(whole[:200])
     with pytest.raises(CheckpointError, match=r"plan\.npz cannot be read"):
         reconstruct(scene, run, CONFIG, resume=True, threads=1, steps=(TrainBlock(1),))
 

@@ -10,16 +10,22 @@ from click.testing import CliRunner
 
 from octasplat.__main__ import cli
 from octasplat.engine.blocks.block_map import SIDE_PX, draw_block_map
-from octasplat.engine.blocks.piece_settings import fewest_blocks
+from octasplat.engine.blocks.piece_settings import (
+    block_settings,
+    fewest_blocks,
+    finish_settings,
+    polish_settings,
+)
 from octasplat.engine.blocks.sparse_plan import plan_from_points
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.dataset import load_dataset_model
 from octasplat.engine.dataset.image_sizes import ImageSizes
-from octasplat.engine.operations.block_cost import estimate_with_blocks
+from octasplat.engine.operations.block_cost import BlockShare, estimate_blocks, estimate_with_blocks
 from octasplat.engine.operations.block_options import BlockOptions, parse_memory
 from octasplat.engine.operations.cost_model import estimate_reconstruction, gaussians_within
 from octasplat.engine.operations.plan import PlanRequest, run
 from octasplat.engine.runs.config import resolve_config
+from octasplat.engine.train.config import TrainConfig
 from tests.support.tiny_dataset import make_tiny_dataset
 
 
@@ -74,6 +80,32 @@ def test_number_of_blocks_grows_with_photographs_and_with_gaussians_that_do_not_
     assert [fewest_blocks(config, views, 10**9, None) for views in (10, 500, 501, 2000)] == [1, 1, 2, 4]
     assert fewest_blocks(config, 100, 10**9, 1_000_000) == 1
     assert fewest_blocks(config, 100, 10**9, 300_000) == 4
+
+
+@pytest.mark.parametrize("length", [5_000, 20_000])
+def test_finish_takes_the_last_steps_of_the_blocks_first(length: int) -> None:
+    config = TrainConfig()
+    block = block_settings(config, 0.5, None, is_finished_later=True).lr.scaled_for(length)
+    finish = finish_settings(config, length, (length, 0, length)).lr.scaled_for(length)
+    assert finish.mean == pytest.approx(block.mean_final)
+    for name in ("quat", "log_scale", "opacity", "color"):
+        assert getattr(finish, name) == pytest.approx(block.decay * getattr(block, name)), name
+    whole = block_settings(config, 0.5, None, is_finished_later=False).lr.scaled_for(length)
+    polish = polish_settings(config, length, (length, 0, length)).lr.scaled_for(length)
+    assert (polish.mean, polish.decay) == (whole.mean_final, 1)
+    for name in ("quat", "log_scale", "opacity", "color"):
+        assert getattr(polish, name) == pytest.approx(whole.decay * getattr(whole, name)), name
+
+
+def test_finish_averages_states_unless_the_settings_forbid_it() -> None:
+    default, last_state = TrainConfig(), TrainConfig(weight_averaging_start=1)
+    assert finish_settings(default, 100).weight_averaging_start == 0.5
+    for settings in (
+        block_settings(last_state, 0.5, None, is_finished_later=True),
+        polish_settings(last_state, 100),
+        finish_settings(last_state, 100),
+    ):
+        assert settings.weight_averaging_start == 1.0
 
 
 def test_gaussians_within_memory_are_those_of_its_estimate() -> None:
@@ -139,6 +171,16 @@ def test_estimate_before_there_is_a_plan_counts_all_blocks() -> None:
     )
     bounded = estimate_with_blocks(config, BlockOptions(blocks=2, memory="1.2G"), photographs, 2)
     assert bounded.memory_bytes <= 1_200_000_000
+
+
+def test_block_that_fills_the_memory_is_estimated_to_take_it() -> None:
+    config = resolve_config("standard", assignments=["max_gaussians=20000000"]).with_poses_decided(True)
+    photographs = [ImageSizes(800, 600, 5000)]
+    most = gaussians_within(config, photographs, 4_000_000_000)
+    costs = estimate_blocks(config, photographs, [BlockShare(0.2, 900, 400_000_000)] * 6, most, 2)
+    # each block reads the model of all photographs
+    assert [cost.memory_bytes for cost in costs.blocks] == pytest.approx([4_000_000_000] * 6, rel=0.01)
+    assert costs.total.memory_bytes == pytest.approx(4_000_000_000, rel=0.01)
 
 
 def test_estimate_without_a_plan_is_near_that_of_the_plan(scene: Path) -> None:

@@ -11,7 +11,7 @@ from PIL import Image
 from octasplat.engine.blocks.block_plan import plan_blocks
 from octasplat.engine.blocks.piece_training import RESULT
 from octasplat.engine.core.errors import CancelledError, ConfigError
-from octasplat.engine.core.events import CheckpointWritten, Event, Noted, TrainingProgress
+from octasplat.engine.core.events import CheckpointWritten, Event, HeldOutMeasured, Noted, TrainingProgress
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
 from octasplat.engine.pipeline import BlockRequest, reconstruct
@@ -152,6 +152,10 @@ def test_progress_counts_all_trainings(two_blocks: tuple) -> None:
     assert [event.iteration for event in told] == sorted(event.iteration for event in told)
     assert told[-1].iteration == told[-1].total_iterations == 150 + 300 * 2 + 200
     assert told[-1].seconds_left == 0
+    # held-out views are those of the whole scene at its full size: of the coarse one nothing is told
+    measured = [event for event in events if isinstance(event, HeldOutMeasured)]
+    assert measured[0].iteration == 150 + 300 * 2 and measured[-1].iteration == told[-1].iteration
+    assert measured[0].seconds <= measured[-1].seconds <= told[-1].seconds + 1
     record = json.loads((run / "training.json").read_text())
     assert record["iterations"] == 950
     assert list(record["pieces"]) == ["coarse", "block_001", "block_002", "finish"]

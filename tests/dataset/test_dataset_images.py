@@ -5,6 +5,7 @@ from octasplat.engine.core.color import linear_to_srgb
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.dataset.images import read_image_info, read_photo
 from octasplat.engine.dataset.masks import read_mask
+from octasplat.engine.render.image_files import read_image
 
 
 def read(path, width=None, height=None):
@@ -143,6 +144,16 @@ def test_truncated_photograph_is_named(tmp_path, save_image, name, capfd):
     (tmp_path / name).write_bytes(data[: len(data) * 2 // 3])
     with pytest.raises(DatasetError, match=name):
         read(tmp_path / name)
+
+
+def test_header_of_other_bytes_than_text_is_told(tmp_path, save_image):
+    path = tmp_path / "a.exr"
+    save_image(path, np.full((4, 4, 3), 0.5, np.float32))
+    # the message of the library quotes it
+    path.write_bytes(path.read_bytes().replace(b"chlist", b"\xffhlist"))
+    for read in (read_image_info, read_image):
+        with pytest.raises(DatasetError, match=r"a\.exr.*header is damaged"):
+            read(path)
 
 
 def test_mask_is_read_and_downscaled(tmp_path, save_image):

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import time
 import unicodedata
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,7 +14,7 @@ import pytest
 
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.scene_layout import lay_out_scene
-from octasplat.engine.dataset import Dataset, load_dataset_model
+from octasplat.engine.dataset import Dataset, depth_maps, load_dataset_model
 from octasplat.engine.dataset.depth_maps import (
     depth_maps_digest,
     find_depth_maps,
@@ -209,6 +210,30 @@ def test_a_scene_keeps_its_depth_maps_apart_from_photographs() -> None:
     assert lay_out_scene(names).files == {name.removeprefix("s/"): name for name in names}
     bare = lay_out_scene(["a.jpg", "b.jpg", "depth/a.png"])
     assert bare.files == {"images/a.jpg": "a.jpg", "images/b.jpg": "b.jpg", "depth/a.png": "depth/a.png"}
+
+
+def test_maps_do_not_pile_up_in_memory(
+    with_maps: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, waiting, most = with_maps(), [0], [0]
+    check_sides = depth_maps._check_sides
+
+    def read(path: Path) -> tuple[np.ndarray, bool]:
+        waiting[0] += 1
+        return read_depth_map(path)
+
+    def check(*args: object) -> None:
+        time.sleep(0.05)  # a slow disk
+        most[0] = max(most[0], waiting[0])
+        waiting[0] -= 1
+        check_sides(*args)
+
+    monkeypatch.setattr(depth_maps, "read_depth_map", read)
+    monkeypatch.setattr(depth_maps, "_check_sides", check)
+    model = load_dataset_model(scene)
+    assert len(model.views) == 8
+    open_depth_maps(model, tmp_path / "cache", "digest", threads=1)
+    assert 0 < most[0] <= 3
 
 
 def test_cached_maps_are_those_of_the_views(with_maps: Callable[..., Path], tmp_path: Path) -> None:

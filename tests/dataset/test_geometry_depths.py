@@ -1,10 +1,12 @@
 """A mesh or a cloud of points beside photographs gives them depths."""
 
 import shutil
+import struct
 from pathlib import Path
 
 import laspy
 import numpy as np
+import pycolmap
 import pytest
 
 from octasplat.engine.core.errors import DatasetError
@@ -98,6 +100,36 @@ def test_laser_scan_is_read_in_full(tmp_path: Path, name: str) -> None:
         read_geometry(path)
 
 
+def test_damaged_laser_scans_are_refused_in_a_sentence(tmp_path: Path) -> None:
+    header = laspy.LasHeader(point_format=3, version="1.4")
+    scan = laspy.LasData(header)
+    scan.x, scan.y, scan.z = np.random.default_rng(2).uniform(0, 100, (3, 500))
+    for name in ("geometry.las", "geometry.laz"):
+        path = tmp_path / name
+        scan.write(path)
+        whole = path.read_bytes()
+        (begin,) = struct.unpack_from("<I", whole, 96)
+        damages = {
+            "records": (100, struct.pack("<I", 1 << 31)),
+            "extended records": (235, struct.pack("<QI", begin, 1 << 31)),
+            "scale": (131, struct.pack("<d", np.nan)),
+        }
+        if path.suffix == ".laz":
+            (table,) = struct.unpack_from("<q", whole, begin)
+            damages["compressed parts"] = (table + 4, struct.pack("<I", (1 << 32) - 1))
+            damages["place of their table"] = (begin, struct.pack("<q", 1 << 60))
+            damages["points of a part"] = (whole.index(b"laszip encoded") + 52 + 12, struct.pack("<I", 0))
+        for where, (place, value) in damages.items():
+            path.write_bytes(whole[:place] + value + whole[place + len(value) :])
+            with pytest.raises(DatasetError, match=name):
+                read_geometry(path)
+                pytest.fail(f"{where} of {name}")
+        for length in (3, 90, 110, 180, 240, 300, len(whole) - 20):
+            path.write_bytes(whole[:length])
+            with pytest.raises(DatasetError, match=name):
+                read_geometry(path)
+
+
 def test_geometry_is_a_part_of_a_scene() -> None:
     assert file_role("geometry.ply") == file_role("Geometry.LAZ") == FileRole.GEOMETRY
     assert file_role("sub/geometry.ply") == FileRole.OTHER
@@ -167,6 +199,23 @@ def test_geometry_elsewhere_is_refused(with_geometry: Path, tmp_path: Path) -> N
         (with_geometry / "geometry.obj").write_text("\n".join(lines) + "\n", encoding="utf-8")
         with pytest.raises(DatasetError, match=r"geometry\.obj .*coordinates of the poses"):
             open_dataset(with_geometry, tmp_path / f"cache{number}")
+
+
+def test_corrected_poses_give_other_distances(with_geometry: Path, tmp_path: Path) -> None:
+    before = open_dataset(with_geometry, tmp_path / "cache")
+    model = pycolmap.Reconstruction(str(load_dataset_model(with_geometry).model_folder))
+    moved = next(image for image in model.images.values() if image.name == before.views[0].name)
+    pose = moved.frame.rig_from_world
+    moved.frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, pose.translation + np.array([0, 0, 0.5]))
+    corrected = tmp_path / "corrected"
+    corrected.mkdir()
+    model.write(str(corrected))
+    geometry = find_known_geometry(with_geometry)
+    after = Dataset.open(with_geometry, tmp_path / "cache", geometry=geometry, model_folder=corrected)
+    fresh = Dataset.open(with_geometry, tmp_path / "fresh", geometry=geometry, model_folder=corrected)
+    np.testing.assert_array_equal(known_distances(after, 0), known_distances(fresh, 0))
+    assert not np.allclose(known_distances(before, 0), known_distances(fresh, 0), rtol=0.02)
+    assert before.views_record.depths_sha256 == after.views_record.depths_sha256  # of the files alone
 
 
 def test_changed_geometry_is_noticed(with_geometry: Path, tmp_path: Path) -> None:

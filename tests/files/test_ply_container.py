@@ -37,6 +37,14 @@ def test_scalars_and_lists_of_equal_length_are_read(tmp_path: Path, layout: str)
     np.testing.assert_array_equal(tables["face"]["flag"], [9, 9])
 
 
+@pytest.mark.parametrize("layout", ["binary_little_endian", "ascii"])
+def test_elements_without_rows_are_read(tmp_path: Path, layout: str) -> None:
+    path = tmp_path / "a.ply"
+    path.write_text((POINTS + FACES).format(layout=layout).replace(" 2\n", " 0\n"), encoding="ascii")
+    _, tables = read_ply(path, ["vertex", "face"])
+    assert len(tables["vertex"]["x"]) == len(tables["face"]["vertex_indices"]) == 0
+
+
 def test_written_files_come_back_block_by_block(tmp_path: Path) -> None:
     dtype = np.dtype([("a", "<f8"), ("b", "u1"), *list_field("corners", "u4", 4)])
     rows = np.zeros(10, dtype)

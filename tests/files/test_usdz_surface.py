@@ -13,7 +13,7 @@ from PIL import Image
 
 from octasplat.engine.core.errors import ConfigError, SceneFileError
 from octasplat.engine.core.georeference import Georeference, matrix_rows
-from octasplat.engine.files import check_surface_path, exporter_for, write_surface
+from octasplat.engine.files import check_surface_path, exporter_for, usdz_surface, write_surface
 from octasplat.engine.files.usdz_surface import write_surface as write_usdz
 from octasplat.engine.geometry.triangle_mesh import MaterialMaps, TriangleMesh
 
@@ -144,6 +144,23 @@ def test_package_is_aligned_stored_and_reproducible(tmp_path: Path) -> None:
         assert entry.compress_type == zipfile.ZIP_STORED
         name, extra = struct.unpack("<HH", data[entry.header_offset + 26 : entry.header_offset + 30])
         assert (entry.header_offset + 30 + name + extra) % 64 == 0
+
+
+def test_package_is_read_by_usd_or_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # zip files have records of ZIP64 above this limit; all as for packages that are 100,000 times as large
+    monkeypatch.setattr("zipfile.ZIP64_LIMIT", (1 << 31) // 100_000)
+    monkeypatch.setattr(usdz_surface, "MAX_BYTES", usdz_surface.MAX_BYTES // 100_000)
+    points, refused = np.random.default_rng(2).random((3000, 3), np.float32), []
+    for count in range(100, 2000, 100):
+        path = tmp_path / f"{count}.usdz"
+        try:
+            write_surface(TriangleMesh(points[:count], FACES), path)
+        except SceneFileError as error:
+            assert "Decimate it with --max-triangles" in str(error) and not path.exists()
+            refused.append(count)
+            continue
+        assert usd.Stage.Open(str(path)).GetPrimAtPath("/octasplat/surface")
+    assert 0 < len(refused) < 15 and refused[-1] == 1900
 
 
 def test_scene_is_turned_upright_about_its_origin(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import pytest
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.georeference import Georeference
 from octasplat.engine.dataset import load_dataset_model
+from octasplat.engine.georeference.control_file import read_control_file
 from octasplat.engine.georeference.find_georeference import find_georeference
 from octasplat.engine.georeference.request import read_request
 from tests.support.located_scene import (
@@ -59,6 +60,13 @@ def find(
 ) -> Georeference | None:
     request = read_request(scene, source, file, length)
     return find_georeference(open_scene(scene, tmp_path / "cache"), request, lambda _text: None)
+
+
+@pytest.mark.parametrize("code", ["EPSG:4549", "EPSG:4647"])
+def test_projected_systems_among_the_numbers_of_degrees_are_read(tmp_path: Path, code: str) -> None:
+    path = tmp_path / "gcp_list.txt"
+    path.write_text(f"{code}\n32691632.1 5334761.4 520.3 10 10 a.jpg a\n", encoding="utf-8")
+    assert read_control_file(path).crs == code
 
 
 @pytest.mark.parametrize("head", ["EPSG:32632", "WGS84 UTM 32N", "+proj=utm +zone=32 +datum=WGS84"])
@@ -138,6 +146,9 @@ def test_known_length_corrects_the_scale_of_gps(scene, tmp_path):
         ("EPSG:32632\n1 2 3 10 10 nothing.png a", "line 2: there is no photograph nothing.png"),
         ("EPSG:4258\n1 2 3 10 10 NAME a", "EPSG:4258 gives no metres"),
         ("somewhere\n1 2 3 10 10 NAME a", "coordinate system 'somewhere' is not known"),
+        ("WGS84 UTM 61N\n1 2 3 10 10 NAME a", "coordinate system 'WGS84 UTM 61N' is not known"),
+        ("+proj=utm +zone=0\n1 2 3 10 10 NAME a", "coordinate system .*zone=0' is not known"),
+        (f"name,x,y,z\n{'a' * 200_000},1,2,3", "line 2: cannot be read"),
         ("EPSG:32632\n1 2 x 10 10 NAME a", "line 2: z is 'x', which is no number"),
         ("EPSG:32632\n1 2 3 10 10 NAME a\n1 2 4 10 10 NAME a", "line 3: a has another position"),
         ("EPSG:32632\n1 2 3 10 10 NAME a", "a is marked in one photograph"),
@@ -161,7 +172,13 @@ def test_files_outside_of_the_scene_or_missing_are_refused(scene, tmp_path, file
         find(scene, tmp_path, file)
 
 
-@pytest.mark.parametrize("length", ["a b", "a b -1", "a a 2", "a 'b 2", "a b nan", "nothing here 2"])
+@pytest.mark.parametrize(
+    "length",
+    [
+        "a b", "a b -1", "a a 2", "a 'b 2", "a b nan", "nothing here 2",
+        "inf,0,0 0,0,0 2", "0,nan,0 0,0,0 2", "1e200,0,0 0,0,0 2", "0,0,0 1,0,0 1e300",
+    ],
+)  # fmt: skip
 def test_bad_lengths_are_refused(scene, tmp_path, length):
     with pytest.raises(ConfigError, match="known_length"):
         find(scene, tmp_path, None, length)

@@ -5,6 +5,8 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from PIL import Image
+from PIL.ExifTags import GPS
 
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.georeference import Georeference
@@ -119,3 +121,29 @@ def test_southern_and_western_positions_and_files_without(scene):
     latitude, longitude, _ = read_gps(scene / "images" / name)
     assert latitude < 0 and longitude < 0
     assert read_gps(scene / "sparse/0/cameras.bin") is None
+
+
+@pytest.mark.parametrize(
+    ("tags", "expected"),
+    [
+        ({}, (48.125, 11.5, 500.0)),
+        ({GPS.GPSLatitudeRef: "s\0", GPS.GPSLongitudeRef: "W"}, (-48.125, -11.5, 500.0)),
+        ({GPS.GPSLatitudeRef: ""}, None),
+        ({GPS.GPSLongitudeRef: "\0"}, None),
+        ({GPS.GPSLatitudeRef: (1, 2)}, None),
+        ({GPS.GPSAltitudeRef: b"\1"}, (48.125, 11.5, -500.0)),
+        ({GPS.GPSAltitudeRef: b"\2"}, (48.125, 11.5, 500.0)),
+        ({GPS.GPSAltitudeRef: b"\3"}, (48.125, 11.5, -500.0)),
+    ],
+    ids=["plain", "south west", "blank", "zero", "no text", "below", "above the sea", "below the sea"],
+)
+def test_position_counts_only_with_its_hemisphere(tmp_path, monkeypatch, tags, expected):
+    path = tmp_path / "a.jpg"
+    Image.new("RGB", (8, 8)).save(path)
+    degrees = {GPS.GPSLatitude: (48.0, 7.0, 30.0), GPS.GPSLongitude: (11.0, 30.0, 0.0)}
+    letters = {GPS.GPSLatitudeRef: "N", GPS.GPSLongitudeRef: "E"}
+    # as read, since not every damage can be written
+    monkeypatch.setattr(
+        Image.Exif, "get_ifd", lambda *_: {**degrees, **letters, GPS.GPSAltitude: 500.0, **tags}
+    )
+    assert read_gps(path) == expected

@@ -49,7 +49,7 @@ HALF_LENGTH = 0.5 * HOUSES * LOT
 FACADE_Y = 9.0
 _WIDTH, _DEPTH = 5 * WINDOW_STEP, 4 * WINDOW_STEP
 _CELL = 0.35
-# As far away as a disc of half a degree, at the height of the afternoon's sun.
+# So far away that its radius is seen as half a degree, twice the sun's, at the height of the afternoon's sun.
 _SUN_DISTANCE = 400.0
 _SUN_WORLD = _SUN_DISTANCE * np.array([0.42, -0.5, 0.76]) / np.linalg.norm([0.42, -0.5, 0.76])
 _SUN = Lamp(

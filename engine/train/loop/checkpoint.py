@@ -29,11 +29,11 @@ CHECKPOINT_FORMAT = 6
 KEPT_CHECKPOINTS = 2
 _PREFIX = "iteration_"
 _GROUPS = ("gaussians", "adam", "average", "densifier", "shading", "poses")
-# What reading a damaged archive may raise; a flipped bit can ask for encryption or a lengthy array.
-_DAMAGE = (
+ARCHIVE_DAMAGE = (
     OSError, KeyError, ValueError, TypeError, AttributeError, EOFError, RuntimeError, MemoryError,
     OverflowError, struct.error, zlib.error, zipfile.BadZipFile,
 )  # fmt: skip
+"""What reading a damaged archive may raise; a flipped bit can ask for encryption or a lengthy array."""
 
 
 def run_fingerprint(dataset: Dataset, config: TrainConfig) -> str:
@@ -124,7 +124,7 @@ def load_checkpoint(path: Path, fingerprint: str | None = None) -> TrainState:
         if sorted(arrays) != meta["arrays"]:
             raise ValueError("arrays are missing")
         groups = _group_arrays(arrays)
-    except _DAMAGE as error:
+    except ARCHIVE_DAMAGE as error:
         raise DamagedCheckpointError(
             f"{path} is damaged ({error}); the one before it is taken, or the run begins anew."
         ) from None
@@ -203,7 +203,7 @@ def load_best(folder: Path) -> BestState:
         groups = _group_arrays(_read_arrays(path))
         gaussians = from_row_arrays(FlatGaussians, groups["gaussians"])
         return BestState(gaussians, groups["shading"], groups["poses"]["corrections"])
-    except _DAMAGE as error:
+    except ARCHIVE_DAMAGE as error:
         raise CheckpointError(f"{path} cannot be read ({error}); train again without --resume.") from None
 
 
