@@ -65,6 +65,7 @@ def starts(bench: WorkerHarness, job_id: object) -> list[int]:
     return [int(line) for line in bench.results(job_id)["history.txt"].split()]  # type: ignore[arg-type]
 
 
+@pytest.mark.exhaustive
 def test_unknown_job_is_left_to_newer_worker(bench: WorkerHarness) -> None:
     old = bench.worker(name="old", STALE_SECONDS="60")
     bench.wait_until_up("old")
@@ -235,6 +236,7 @@ def test_front_end_is_upgraded_before_workers(service: Service) -> None:
     service.check_succeeded(under_way, "new", service.begun_twice(35))
 
 
+@pytest.mark.exhaustive
 def test_workers_are_upgraded_before_front_end(service: Service) -> None:
     """Jobs are under way at both changes, and those of the old front end are run by the new worker."""
     bench = service.bench
@@ -254,6 +256,7 @@ def test_workers_are_upgraded_before_front_end(service: Service) -> None:
     service.check_succeeded(under_way, "new", [0])
 
 
+@pytest.mark.exhaustive
 def test_releases_go_on_with_jobs_of_each_other(service: Service) -> None:
     """Workers of both are killed; each goes on with what the other began if their results are the same."""
     bench = service.bench

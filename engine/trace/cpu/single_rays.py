@@ -127,8 +127,11 @@ class SingleRayTracer:
 
     def _ray_query(self, function: int) -> EmbreeRayQuery:
         assert self._bvh is not None, "build first"
-        views = (self._scratch.view(kind) for kind in (np.int32, np.float64, np.uint64))
-        return EmbreeRayQuery(function, self._bvh.handle, self._scratch, *views, self._arguments)
+        words = self._scratch
+        return EmbreeRayQuery(
+            function, self._bvh.handle, words,
+            words.view(np.int32), words.view(np.float64), words.view(np.uint64), self._arguments,
+        )  # fmt: skip
 
 
 def _rays_per_chunk(ray_indices: Int64[np.ndarray, " s"]) -> int:
