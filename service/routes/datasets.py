@@ -7,7 +7,8 @@ from fastapi import APIRouter, Header, Path, Request, Response
 from starlette.requests import ClientDisconnect
 
 from octasplat.service.actions import datasets as actions
-from octasplat.service.actions import uploads
+from octasplat.service.actions import reused_files, uploads
+from octasplat.service.actions.reused_files import WantedFile
 from octasplat.service.actions.usage import rate_limit_headers
 from octasplat.service.auth import Reader, Writer
 from octasplat.service.downloads import send_blob
@@ -39,8 +40,10 @@ from octasplat.service.schemas.datasets import (
     DatasetPage,
     DatasetView,
     FilePage,
+    FilesToReuse,
     FileView,
     NewDataset,
+    ReusedFilesView,
 )
 from octasplat.service.state import ServiceDep
 from octasplat.workers.db.rows import Dataset
@@ -131,6 +134,22 @@ async def list_files(
     part = await uploads.list_files(service, principal, dataset_id, after=after, limit=limit)
     following = set_next_link(request, response, part.next_key)
     return FilePage(files=[FileView.from_row(row) for row in part.rows], next=following)
+
+
+@router.post("/{dataset_id}/files", responses=problem_responses(404, 409, 413))
+async def reuse_files(
+    dataset_id: DatasetId, wanted: FilesToReuse, principal: Writer, service: ServiceDep,
+    _key: IdempotencyKey = None,
+) -> ReusedFilesView:  # fmt: skip
+    """Take over files by their digests, as far as the dataset's owner has stored them before; send the rest.
+
+    The files are checked as if they had been sent, and stay when what they are taken from is deleted.
+    """
+    files = [WantedFile(file.path, file.sha256) for file in wanted.files]
+    reused = await reused_files.reuse_files(service, principal, dataset_id, files)
+    return ReusedFilesView(
+        files=[FileView.from_row(row) for row in reused.files], missing=list(reused.missing)
+    )
 
 
 @router.put(

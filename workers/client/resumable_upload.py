@@ -69,7 +69,8 @@ def send_resumable(
             reached = _offset(api, address)
         except ServiceError as error:
             # Another connection, perhaps that of before, has brought more; or it is to be repeated.
-            if error.status not in {_CONFLICT, *BUSY_STATUSES, *UNAVAILABLE_STATUSES} or not patience.wait():
+            is_passing = error.status in {_CONFLICT, *BUSY_STATUSES, *UNAVAILABLE_STATUSES}
+            if not is_passing or not patience.wait(error.retry_seconds):
                 raise
             reached = _offset(api, address)
         else:

@@ -57,7 +57,8 @@ def submit(api: Api, submission: Submission, on_event: EventListener = ignore_ev
     Args:
         api: the service.
         submission: the scene and what to do with it.
-        on_event: receives the stage ``upload``, whose steps are kB, and of what the service warns of.
+        on_event: receives the stage ``upload``, whose steps are kB, what was not sent, and what the service
+            warns of.
 
     Raises:
         OctasplatError: the scene or the options are refused, or the service does not answer.
@@ -189,7 +190,11 @@ def derive(api: Api, derivation: Derivation, on_event: EventListener = ignore_ev
     if derivation.files:
         with counted_phase("upload", on_event) as progress:
             sent = upload_files(
-                api, derivation.files, name="stage", progress=lambda d, t: progress(d >> 10, t >> 10)
+                api,
+                derivation.files,
+                name="stage",
+                progress=lambda d, t: progress(d >> 10, t >> 10),
+                on_note=lambda sentence: on_event(Noted(sentence)),
             )
         body["files_id"] = sent["id"]
     job: dict[str, Any] = api.post("/v1/jobs", body)
@@ -271,6 +276,7 @@ def _upload_if_needed(api: Api, scene: Path | str, on_event: EventListener, sha2
             Path(scene),
             progress=lambda d, t: progress(d >> 10, t >> 10),
             on_warning=lambda sentence: on_event(Warned(sentence)),
+            on_note=lambda sentence: on_event(Noted(sentence)),
         )
     return _id_with_notes(dataset, on_event)
 
