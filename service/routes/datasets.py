@@ -166,7 +166,7 @@ async def put_file(
     response: Response, digest: Digest = None,
 ) -> FileView:  # fmt: skip
     """Send a file: the body is its content. A repeat with the same digest does nothing."""
-    file = await uploads.put_file(service, principal, dataset_id, path, _upload_of_request(request, digest))
+    file = await uploads.put_file(service, principal, dataset_id, path, upload_of_request(request, digest))
     if file.is_unchanged:
         response.status_code = 200
     return FileView.from_row(file.row)
@@ -206,7 +206,7 @@ async def put_archive(
     dataset_id: DatasetId, principal: Writer, service: ServiceDep, request: Request, digest: Digest = None
 ) -> ArchiveView:
     """Upload a scene as a ZIP file; its files are added to those that are there."""
-    archive = await uploads.put_archive(service, principal, dataset_id, _upload_of_request(request, digest))
+    archive = await uploads.put_archive(service, principal, dataset_id, upload_of_request(request, digest))
     return _archive_view(archive)
 
 
@@ -222,7 +222,8 @@ def _dataset_etag(dataset: Dataset) -> str:
     return f'"{dataset.version}"'
 
 
-def _upload_of_request(request: Request, digest: str | None) -> uploads.Upload:
+def upload_of_request(request: Request, digest: str | None) -> uploads.Upload:
+    """Return what a request sends, as it announces it."""
     text = request.headers.get("content-length")
     length = int(text) if text is not None and text.isdigit() else None
     return uploads.Upload(request_body(request), sha256=parse_digest(digest), size_bytes=length)

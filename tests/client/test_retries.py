@@ -288,7 +288,8 @@ def test_busy_service_is_left_alone_for_as_long_as_it_asks(
             document = json.dumps({"detail": "Too many uploads are unfinished."}).encode()
             return 429, {"Retry-After": "30", "Content-Type": "application/problem+json"}, document
         if method == "POST":
-            return 201, {"Location": "/v1/datasets/d0/uploads/u"}, b""
+            made = json.dumps({"size_bytes": 1, "offset_bytes": 0}).encode()
+            return 201, {"Location": "/v1/datasets/d0/uploads/u"}, made
         told = {"Upload-Offset": "1", "Location": "/v1/datasets/d0/tasks/t"}
         return (200, {"Upload-Offset": "0"}, b"") if method == "HEAD" else (204, told, b"")
 

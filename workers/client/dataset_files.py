@@ -56,9 +56,15 @@ def send_files(
     unsent: list[LocalFile] = []
     jobs: list[Future[None]] = []
 
+    connections = threading.Semaphore(PARALLEL_UPLOADS)
+
     def send(file: LocalFile, sha256: str) -> None:
-        with counter.part() as tell:
-            send_file(api, dataset_id, file, sha256, tell)
+        if file.size_bytes >= MIN_RESUMABLE_BYTES:
+            with counter.part() as tell:
+                send_resumable(api, dataset_id, file.path, file.name, sha256, tell, connections)
+        else:
+            with connections:
+                put_file(api, _file_address(dataset_id, file.name), file.path, sha256)
         counter.add(file.size_bytes)
 
     with ThreadPoolExecutor(PARALLEL_UPLOADS) as reading, ThreadPoolExecutor(PARALLEL_UPLOADS) as sending:
@@ -80,21 +86,6 @@ def send_files(
             sending.shutdown(wait=True, cancel_futures=True)
     _raise_failure(jobs)
     return unsent
-
-
-def send_file(
-    api: Api, dataset_id: str, file: LocalFile, sha256: str, progress: Callable[[int], None]
-) -> None:
-    """Send one file: a large one in parts, which go on after a break.
-
-    Raises:
-        ServiceError: the service refuses it.
-        ServiceUnreachableError: the service was away for too long.
-    """
-    if file.size_bytes >= MIN_RESUMABLE_BYTES:
-        send_resumable(api, dataset_id, file.path, file.name, sha256, progress)
-    else:
-        put_file(api, _file_address(dataset_id, file.name), file.path, sha256)
 
 
 def put_file(api: Api, address: str, path: Path, sha256: str) -> Any:
