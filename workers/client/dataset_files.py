@@ -4,7 +4,8 @@ import base64
 import hashlib
 import threading
 import urllib.parse
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import uuid
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,6 +16,8 @@ from octasplat.workers.client.api import Api, ServiceError
 from octasplat.workers.client.resumable_upload import MIN_RESUMABLE_BYTES, send_resumable
 
 PARALLEL_UPLOADS = 4
+MAX_DELETED_DATASETS = 30
+"""So many datasets of the same files that were deleted are looked past for one that is there."""
 MAX_ASKED_FILES = 500
 """Files that the service is asked for at once; the next ones are read meanwhile."""
 MAX_ASKED_BYTES = 1 << 18
@@ -30,6 +33,25 @@ class LocalFile:
     name: str
     path: Path
     size_bytes: int
+
+
+def create_dataset_once(api: Api, body: Mapping[str, Any], key: str) -> dict[str, Any]:
+    """Return the dataset that was made with a key before, or a new one.
+
+    Raises:
+        ServiceError: the owner has too many datasets.
+        ServiceUnreachableError: the service was away for too long.
+    """
+    for number in range(MAX_DELETED_DATASETS):
+        try:
+            found: dict[str, Any] = api.post("/v1/datasets", body, key=f"{key}-{number}" if number else key)
+        except ServiceError as error:
+            if error.status != 404:  # it was deleted since, and the next one may be there
+                raise
+        else:
+            return found
+    made: dict[str, Any] = api.post("/v1/datasets", body, key=uuid.uuid4().hex)
+    return made
 
 
 def send_files(
@@ -50,9 +72,8 @@ def send_files(
         ServiceError: the service refuses one; the text names it.
         ServiceUnreachableError: the service was away for too long.
     """
-    there = {f["path"]: f["sha256"] for f in _listed_files(api, dataset_id)}
-    _remove_files(api, dataset_id, there.keys() - {file.name for file in files})
-    counter = _ProgressCounter(sum(file.size_bytes for file in files), progress)
+    there = keep_files(api, dataset_id, {file.name for file in files})
+    counter = ProgressCounter(sum(file.size_bytes for file in files), progress)
     unsent: list[LocalFile] = []
     jobs: list[Future[None]] = []
 
@@ -86,6 +107,24 @@ def send_files(
             sending.shutdown(wait=True, cancel_futures=True)
     _raise_failure(jobs)
     return unsent
+
+
+def keep_files(api: Api, dataset_id: str, names: Set[str]) -> dict[str, str]:
+    """Return the digests of those files, by name, that a dataset has; others of an earlier try are removed.
+
+    Raises:
+        ServiceError: the dataset is not open.
+        ServiceUnreachableError: the service was away for too long.
+    """
+    listed = api.iterate_pages(f"/v1/datasets/{dataset_id}/files", "files", limit=5000)
+    there: dict[str, str] = {file["path"]: file["sha256"] for file in listed}
+    for name in there.keys() - names:
+        try:
+            api.request("DELETE", _file_address(dataset_id, name))
+        except ServiceError as error:
+            if error.status != 404:  # an earlier try, whose answer was lost, has removed it
+                raise
+    return {name: sha256 for name, sha256 in there.items() if name in names}
 
 
 def put_file(api: Api, address: str, path: Path, sha256: str) -> Any:
@@ -125,20 +164,6 @@ def _format_size(size_bytes: int) -> str:
         if size_bytes >= unit:
             return f"{size_bytes / unit:.1f} {name}"
     return f"{size_bytes} bytes"
-
-
-def _listed_files(api: Api, dataset_id: str) -> Iterator[dict[str, Any]]:
-    return api.iterate_pages(f"/v1/datasets/{dataset_id}/files", "files", limit=5000)
-
-
-def _remove_files(api: Api, dataset_id: str, names: set[str]) -> None:
-    """Remove what an earlier try has sent and the folder does not hold any more."""
-    for name in names:
-        try:
-            api.request("DELETE", _file_address(dataset_id, name))
-        except ServiceError as error:
-            if error.status != 404:  # an earlier try, whose answer was lost, has removed it
-                raise
 
 
 def _reuse_files(api: Api, dataset_id: str, digests: Mapping[str, str]) -> set[str]:
@@ -188,7 +213,14 @@ class _RereadableFile:
                 yield piece
 
 
-class _ProgressCounter:
+class ProgressCounter:
+    """Counts bytes of several threads.
+
+    Args:
+        total: of all of them.
+        progress: called with (bytes done, total).
+    """
+
     def __init__(self, total: int, progress: Callable[[int, int], None]) -> None:
         self._done, self._total, self._progress = 0, total, progress
         self._lock = threading.Lock()

@@ -15,6 +15,7 @@ from octasplat.engine.pathtracing.stage.stage_file import read_stage, referenced
 from octasplat.engine.render.path_document import read_path_document
 from octasplat.engine.settings.nested_options import merge_options
 from octasplat.workers.client.api import Api
+from octasplat.workers.client.bucket import import_bucket, is_bucket_address
 from octasplat.workers.client.dataset_tasks import import_scene, is_web_address
 from octasplat.workers.client.download import download_archive, download_results
 from octasplat.workers.client.upload import upload_files, upload_scene
@@ -32,8 +33,8 @@ class Submission:
     """Description of a job to submit.
 
     Attributes:
-        scene: folder of photographs, ZIP file, the id of a dataset, or the address of a ZIP file, as text;
-            None takes the photographs of ``start_from``.
+        scene: folder of photographs, ZIP file, the id of a dataset, or as text the address of a ZIP file, or
+            of a folder in a bucket; None takes the photographs of ``start_from``.
         options: of the reconstruction.
         label: what to call the job.
         queue: which workers.
@@ -270,6 +271,17 @@ def _upload_if_needed(api: Api, scene: Path | str, on_event: EventListener, sha2
     if isinstance(scene, str) and is_web_address(scene):
         on_event(Noted(f"The service fetches {scene}."))
         return _id_with_notes(import_scene(api, scene, sha256=sha256), on_event)
+    if isinstance(scene, str) and is_bucket_address(scene):
+        on_event(Noted(f"The service fetches {scene}."))
+        with counted_phase("upload", on_event) as progress:
+            dataset = import_bucket(
+                api,
+                scene,
+                sha256=sha256,
+                progress=lambda d, t: progress(d >> 10, t >> 10),
+                on_warning=lambda sentence: on_event(Warned(sentence)),
+            )
+        return _id_with_notes(dataset, on_event)
     with counted_phase("upload", on_event) as progress:
         dataset = upload_scene(
             api,

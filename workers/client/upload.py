@@ -1,16 +1,16 @@
 """A folder of photographs, or a ZIP file, to a dataset; what has arrived before is not sent again."""
 
 import hashlib
-import uuid
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.scene_layout import is_ignored_file
-from octasplat.workers.client.api import Api, ServiceError
+from octasplat.workers.client.api import Api
 from octasplat.workers.client.dataset_files import (
     LocalFile,
+    create_dataset_once,
     describe_unsent,
     put_file,
     send_files,
@@ -19,8 +19,6 @@ from octasplat.workers.client.dataset_files import (
 from octasplat.workers.client.dataset_tasks import commit
 from octasplat.workers.client.resumable_upload import MIN_RESUMABLE_BYTES, send_resumable
 
-MAX_DELETED_DATASETS = 30
-"""So many datasets of one folder that were deleted are looked past for one that is there."""
 _ARCHIVE_END_BYTES = 1 << 18
 """So much of the end of an archive is shown first; it holds the names of a thousand files."""
 _ARCHIVE_END_TRIES = 4
@@ -45,13 +43,36 @@ def list_scene_files(
         for name, path in paths.items()
         if not is_ignored_file(name)
     ]
-    preview = api.post("/v1/scene-previews", {"files": listed})
-    _tell_preview(scene, preview, on_warning)
-    files = [LocalFile(file["name"], paths[file["path"]], file["size_bytes"]) for file in preview["files"]]
+    taken = preview_files(api, str(scene), listed, on_warning)
+    files = [LocalFile(file["name"], paths[file["path"]], file["size_bytes"]) for file in taken]
     for file in files:
         if _replace_non_utf8(str(file.path)) != str(file.path):
             raise DatasetError(f"The name of {str(file.path)!a} is not UTF-8; rename the file.")
     return files
+
+
+def preview_files(
+    api: Api, scene: str, listed: Sequence[Mapping[str, Any]], on_warning: Callable[[str], None]
+) -> list[dict[str, Any]]:
+    """Return which of the listed files the service takes; what it leaves out is told.
+
+    Args:
+        api: the service.
+        scene: what the files are of, for the error.
+        listed: ``path`` and ``size_bytes`` of each file.
+        on_warning: called with a sentence on which files are left out.
+
+    Returns:
+        ``name`` in the dataset, ``path`` and ``size_bytes`` of each.
+
+    Raises:
+        DatasetError: the service would refuse them.
+        ServiceError: the service cannot be asked.
+    """
+    preview = api.post("/v1/scene-previews", {"files": listed})
+    _tell_preview(scene, preview, on_warning)
+    taken: list[dict[str, Any]] = preview["files"]
+    return taken
 
 
 def _replace_non_utf8(name: str) -> str:
@@ -77,10 +98,10 @@ def _preview_archive(api: Api, archive: Path, on_warning: Callable[[str], None])
         needed = preview["needed_bytes"]
         if needed is None or needed <= len(end):
             break
-    _tell_preview(archive, preview, on_warning)
+    _tell_preview(str(archive), preview, on_warning)
 
 
-def _tell_preview(scene: Path, preview: Mapping[str, Any], on_warning: Callable[[str], None]) -> None:
+def _tell_preview(scene: str, preview: Mapping[str, Any], on_warning: Callable[[str], None]) -> None:
     for sentence in preview["notes"]:
         on_warning(sentence)
     if preview["refusals"]:
@@ -169,17 +190,7 @@ def _find_or_create_dataset(
         facts = file.path.stat()
         digest.update(f"{file.name}\0{facts.st_size}\0{facts.st_mtime_ns}\0{facts.st_ino}\n".encode())
     body = {"name": name, "holds": holds} if holds == "files" else {"name": name}
-    key = f"scene-{digest.hexdigest()}"
-    for number in range(MAX_DELETED_DATASETS):
-        try:
-            found: dict[str, Any] = api.post("/v1/datasets", body, key=f"{key}-{number}" if number else key)
-        except ServiceError as error:
-            if error.status != 404:  # it was deleted since, and the next one may be there
-                raise
-        else:
-            return found
-    made: dict[str, Any] = api.post("/v1/datasets", body, key=uuid.uuid4().hex)
-    return made
+    return create_dataset_once(api, body, f"scene-{digest.hexdigest()}")
 
 
 def _send_folder(
