@@ -298,6 +298,35 @@ def test_busy_service_is_left_alone_for_as_long_as_it_asks(
     assert pauses == [30.0, 30.0]
 
 
+@pytest.mark.parametrize("part_bytes", [0, 1])
+def test_file_that_was_stored_before_the_answer_to_its_last_part_was_lost(
+    serve: Callable[..., Front], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part_bytes: int
+) -> None:
+    monkeypatch.setattr("octasplat.workers.client.dataset_files.MIN_RESUMABLE_BYTES", 1)
+    service, is_stored = Datasets(), False
+    (tmp_path / "a.obj").write_text("x")
+    etag = f'"{hashlib.sha256(b"x").hexdigest()}"'
+
+    def answer(method: str, path: str, headers: dict[str, str], body: bytes) -> Answer:
+        nonlocal is_stored
+        if method == "HEAD" and path.endswith("/files/a.obj"):
+            return 200, {"ETag": etag}, b""
+        if "/uploads" not in path:
+            return service(method, path, headers, body)
+        if method == "POST":
+            made = {"size_bytes": 1, "offset_bytes": 0, "part_bytes": part_bytes}
+            return 201, {"Location": "/v1/datasets/d0/uploads/u"}, json.dumps(made).encode()
+        if is_stored:
+            return as_json({"detail": "There is no such upload."}, 404)
+        is_stored = method in ("PUT", "PATCH")
+        return as_page(502) if is_stored else (200, {"Upload-Offset": "0"}, b"")
+
+    front = serve(answer)
+    with Api(front.address) as api:
+        assert upload_files(api, {"a.obj": tmp_path / "a.obj"})["state"] == "committed"
+    assert sum(asked.startswith(("PUT", "PATCH")) for asked in front.asked) == (2 if part_bytes else 1)
+
+
 def test_commit_after_interrupted_check_succeeds(serve: Callable[..., Front], tmp_path: Path) -> None:
     service = Datasets()
     service.refusals = 3

@@ -8,6 +8,7 @@ import hashlib
 from collections.abc import Callable
 from pathlib import Path
 from threading import Semaphore
+from urllib.parse import quote
 
 import httpx
 
@@ -57,11 +58,36 @@ def send_resumable(
     """
     upload = _find_or_create(api, dataset_id, name, sha256, path.stat().st_size)
     task = None
-    if upload.can_take_parts:
-        task = send_parts(api, upload, path, progress, connections or Semaphore(PARALLEL_PARTS))
-    if task is None:
-        task = _send_in_order(api, upload, path, progress)
+    try:
+        if upload.can_take_parts:
+            task = send_parts(api, upload, path, progress, connections or Semaphore(PARALLEL_PARTS))
+        if task is None:
+            task = _send_in_order(api, upload, path, progress)
+    except ServiceError as error:
+        # The answer to the last part was lost, and the file was stored before it was asked for again.
+        if error.status == _NOT_FOUND and _is_stored(api, dataset_id, name, sha256):
+            return
+        raise
     wait_for_task(api, api.get(task))
+
+
+def _is_stored(api: Api, dataset_id: str, name: str | None, sha256: str) -> bool:
+    """Return whether a dataset has a file, or what was in a ZIP file, whose upload is over.
+
+    Raises:
+        ServiceError: the content of the ZIP file was refused.
+    """
+    if name is None:
+        # An archive is sent to a dataset of its own.
+        tasks = api.get(f"/v1/datasets/{dataset_id}/tasks", limit=1)["tasks"]
+        return bool(tasks) and tasks[0]["kind"] == "upload" and bool(wait_for_task(api, tasks[0]))
+    try:
+        answer = api.request("HEAD", f"/v1/datasets/{dataset_id}/files/{quote(name)}")
+    except ServiceError as error:
+        if error.status != _NOT_FOUND:
+            raise
+        return False
+    return answer.headers.get("ETag") == f'"{sha256}"'
 
 
 def _send_in_order(api: Api, upload: Upload, path: Path, progress: Callable[[int], None]) -> str:

@@ -34,14 +34,14 @@ class Upload:
     parts_ahead: frozenset[int]
 
     @classmethod
-    def from_answer(cls, address: str, told: Mapping[str, Any]) -> "Upload":
+    def from_answer(cls, address: str, view: Mapping[str, Any]) -> "Upload":
         """Return the upload of an answer."""
         return cls(
             address,
-            told["size_bytes"],
-            told["offset_bytes"],
-            told.get("part_bytes", 0),
-            frozenset(told.get("parts_ahead", ())),
+            view["size_bytes"],
+            view["offset_bytes"],
+            view.get("part_bytes", 0),
+            frozenset(view.get("parts_ahead", ())),
         )
 
     @property
