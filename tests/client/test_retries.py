@@ -327,6 +327,40 @@ def test_file_that_was_stored_before_the_answer_to_its_last_part_was_lost(
     assert sum(asked.startswith(("PUT", "PATCH")) for asked in front.asked) == (2 if part_bytes else 1)
 
 
+def test_large_and_small_files_share_four_connections(
+    serve: Callable[..., Front], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("octasplat.workers.client.dataset_files.MIN_RESUMABLE_BYTES", 8)
+    service, lock, now, most = Datasets(), threading.Lock(), [0], [0]
+    files = {f"{number}.obj": tmp_path / f"{number}.obj" for number in range(8)}
+    for number, path in enumerate(files.values()):
+        path.write_text("x" * (8 if number % 2 else 1))
+
+    def answer(method: str, path: str, headers: dict[str, str], body: bytes) -> Answer:
+        if path.endswith("/t"):
+            return as_json({"id": "t", "dataset_id": "d0", "state": "succeeded", "problem": None})
+        if method == "POST" and path.endswith("/uploads"):
+            made = {"size_bytes": 8, "offset_bytes": 0, "part_bytes": 1, "parts_ahead": [3]}
+            return 201, {"Location": "/v1/datasets/d0/uploads/u"}, json.dumps(made).encode()
+        if method != "PUT":
+            return service(method, path, headers, body)
+        with lock:
+            now[0] += 1
+            most[0] = max(most[0], now[0])
+        time.sleep(0.02)
+        with lock:
+            now[0] -= 1
+        return 204, {"Location": "/v1/datasets/d0/tasks/t"}, b""
+
+    told: list[int] = []
+    front = serve(answer)
+    with Api(front.address) as api:
+        assert upload_files(api, files, progress=lambda d, _t: told.append(d))["state"] == "committed"
+    assert 1 < most[0] <= 4
+    assert sum(asked.startswith("PUT") for asked in front.asked) == 4 + 4 * 7
+    assert told[-1] == max(told) == 4 * 1 + 4 * 8
+
+
 def test_commit_after_interrupted_check_succeeds(serve: Callable[..., Front], tmp_path: Path) -> None:
     service = Datasets()
     service.refusals = 3
