@@ -197,6 +197,21 @@ async def test_content_that_the_store_has_lost_or_damaged_is_sent(
         assert (set(taken), missing) == (contents.keys() - {lost, cut}, [lost, cut])
 
 
+async def test_files_are_taken_within_a_bucket(
+    connect_service: ConnectService, s3_address: str, s3_bucket: str
+) -> None:
+    storage = f"s3://{s3_bucket}/store?endpoint_url={s3_address}"
+    pictures = {f"images/{width}.png": photograph(width) for width in range(30, 34)}
+    lost, *kept = pictures
+    async with connect_service(storage=storage) as (http, service):
+        await filled_dataset(http, pictures)
+        await asyncio.to_thread(service.storage.delete, sha256(pictures[lost]))
+        second = await new_dataset(http)
+        assert await reuse(http, second, pictures) == (kept, [lost])
+        assert (await http.put(f"{second}/files/{lost}", content=pictures[lost])).status_code == 201
+        assert (await http.post(f"{second}/commit")).json()["photographs"] == 4
+
+
 async def test_contents_and_names_are_checked_as_if_they_were_sent(connect_service: ConnectService) -> None:
     async with connect_service() as (http, service):
         await filled_dataset(http, {"notes.txt": b"no picture"}, holds="files")
