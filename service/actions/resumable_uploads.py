@@ -104,7 +104,7 @@ async def get_upload(
     """
     async with service.pool.connection() as connection:
         await fetch_visible_dataset(connection, principal, dataset_id)
-        return await _upload_in(connection, dataset_id, upload_id)
+        return await upload_in(connection, dataset_id, upload_id)
 
 
 async def continue_upload(
@@ -125,7 +125,7 @@ async def continue_upload(
     check_not_draining(service)
     async with service.pool.connection() as connection:
         await open_dataset(connection, principal, dataset_id)
-        upload = await _upload_in(connection, dataset_id, upload_id)
+        upload = await upload_in(connection, dataset_id, upload_id)
     if upload.offset_bytes != offset_bytes:
         raise ConflictError(f"{upload.offset_bytes} bytes of the upload have come; go on behind them.")
     left = upload.size_bytes - offset_bytes
@@ -142,7 +142,7 @@ async def continue_upload(
                     await rows.add_part(connection, upload, part)
                     await check_bytes(connection, upload.owner, service.settings.quota)
                 offset_bytes += blob.size_bytes
-    return await _store_if_whole(service, upload)
+    return await store_if_whole(service, upload)
 
 
 @retry_on_deadlock
@@ -157,9 +157,9 @@ async def delete_upload(
     """
     async with service.pool.connection() as connection, connection.transaction():
         await fetch_visible_dataset(connection, principal, dataset_id)
-        upload = await _upload_in(connection, dataset_id, upload_id)
+        upload = await upload_in(connection, dataset_id, upload_id)
         await lock_owner(connection, upload.owner)
-        upload = await _upload_in(connection, dataset_id, upload_id, lock=True)
+        upload = await upload_in(connection, dataset_id, upload_id, lock=True)
         if await _is_being_stored(connection, upload):
             raise ConflictError("All of the upload has come, and the file is being stored.")
         await rows.delete_upload(connection, upload)
@@ -201,11 +201,14 @@ async def _content(storage: Storage, parts: Sequence[UploadPart]) -> AsyncIterat
 
 
 @retry_on_deadlock
-async def _store_if_whole(service: Service, upload: FileUpload) -> FileUpload:
+async def store_if_whole(service: Service, upload: FileUpload) -> FileUpload:
     """Begin the task that stores an upload of which all has come, again if the last one failed.
 
     Returns:
         The upload as it is.
+
+    Raises:
+        ProblemError: 404.
     """
     async with service.pool.connection() as connection, connection.transaction():
         # Of two requests that bring the end at once, only one begins the task.
@@ -250,9 +253,14 @@ async def _is_being_stored(connection: Connection, upload: FileUpload) -> bool:
     return task is not None and not task.is_over
 
 
-async def _upload_in(
+async def upload_in(
     connection: Connection, dataset_id: uuid.UUID, upload_id: uuid.UUID, *, lock: bool = False
 ) -> FileUpload:
+    """Return an upload into a dataset.
+
+    Raises:
+        ProblemError: 404.
+    """
     upload = await rows.get_upload(connection, upload_id, lock=lock)
     if upload is None or upload.dataset_id != dataset_id:
         raise not_found_error("upload")

@@ -30,6 +30,8 @@ from octasplat.workers.storage.verifying_writer import VerifyingWriter
 PIECE_BYTES = 1 << 20
 PART_BYTES = 16 << 20
 """Parts of an upload that can be continued; what has come of the last one is lost with the process."""
+PARALLEL_PART_BYTES = 8 << 20
+"""Parts that come in any order, several at once; one whose connection breaks is lost."""
 _SHA256 = re.compile(r"(?:^|,)\s*sha-256\s*=\s*:([A-Za-z0-9+/=]*):\s*(?:;[^,]*)?(?=,|$)")
 
 

@@ -7,7 +7,8 @@ from fastapi import APIRouter, Header, Path, Request, Response
 from starlette.requests import ClientDisconnect
 
 from octasplat.service.actions import datasets as actions
-from octasplat.service.actions import uploads
+from octasplat.service.actions import reused_files, uploads
+from octasplat.service.actions.reused_files import WantedFile
 from octasplat.service.actions.usage import rate_limit_headers
 from octasplat.service.auth import Reader, Writer
 from octasplat.service.downloads import send_blob
@@ -39,8 +40,10 @@ from octasplat.service.schemas.datasets import (
     DatasetPage,
     DatasetView,
     FilePage,
+    FilesToReuse,
     FileView,
     NewDataset,
+    ReusedFilesView,
 )
 from octasplat.service.state import ServiceDep
 from octasplat.workers.db.rows import Dataset
@@ -133,6 +136,22 @@ async def list_files(
     return FilePage(files=[FileView.from_row(row) for row in part.rows], next=following)
 
 
+@router.post("/{dataset_id}/files", responses=problem_responses(404, 409, 413))
+async def reuse_files(
+    dataset_id: DatasetId, wanted: FilesToReuse, principal: Writer, service: ServiceDep,
+    _key: IdempotencyKey = None,
+) -> ReusedFilesView:  # fmt: skip
+    """Take over files by their digests, as far as the dataset's owner has stored them before; send the rest.
+
+    The files are checked as if they had been sent, and stay when what they are taken from is deleted.
+    """
+    files = [WantedFile(file.path, file.sha256) for file in wanted.files]
+    reused = await reused_files.reuse_files(service, principal, dataset_id, files)
+    return ReusedFilesView(
+        files=[FileView.from_row(row) for row in reused.files], missing=list(reused.missing)
+    )
+
+
 @router.put(
     "/{dataset_id}/files/{path:path}",
     status_code=201,
@@ -147,7 +166,7 @@ async def put_file(
     response: Response, digest: Digest = None,
 ) -> FileView:  # fmt: skip
     """Send a file: the body is its content. A repeat with the same digest does nothing."""
-    file = await uploads.put_file(service, principal, dataset_id, path, _upload_of_request(request, digest))
+    file = await uploads.put_file(service, principal, dataset_id, path, upload_of_request(request, digest))
     if file.is_unchanged:
         response.status_code = 200
     return FileView.from_row(file.row)
@@ -187,7 +206,7 @@ async def put_archive(
     dataset_id: DatasetId, principal: Writer, service: ServiceDep, request: Request, digest: Digest = None
 ) -> ArchiveView:
     """Upload a scene as a ZIP file; its files are added to those that are there."""
-    archive = await uploads.put_archive(service, principal, dataset_id, _upload_of_request(request, digest))
+    archive = await uploads.put_archive(service, principal, dataset_id, upload_of_request(request, digest))
     return _archive_view(archive)
 
 
@@ -203,7 +222,8 @@ def _dataset_etag(dataset: Dataset) -> str:
     return f'"{dataset.version}"'
 
 
-def _upload_of_request(request: Request, digest: str | None) -> uploads.Upload:
+def upload_of_request(request: Request, digest: str | None) -> uploads.Upload:
+    """Return what a request sends, as it announces it."""
     text = request.headers.get("content-length")
     length = int(text) if text is not None and text.isdigit() else None
     return uploads.Upload(request_body(request), sha256=parse_digest(digest), size_bytes=length)

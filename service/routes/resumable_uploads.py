@@ -1,6 +1,6 @@
 """Routes of uploads of one large file each that go on after a break, as tus 1.0.0 has them.
 
-Of its extensions: creation, expiration and termination.
+Of its extensions: creation, expiration and termination. Beside it, parts may come in any order.
 """
 
 import base64
@@ -13,11 +13,13 @@ from typing import Annotated
 from fastapi import APIRouter, Header, Path, Request, Response
 
 from octasplat.service.actions import resumable_uploads as actions
+from octasplat.service.actions import upload_parts
 from octasplat.service.actions.resumable_uploads import NewUpload
+from octasplat.service.actions.upload_parts import parts_ahead
 from octasplat.service.auth import Reader, Writer
 from octasplat.service.problems import ProblemError
 from octasplat.service.routes import problem_responses
-from octasplat.service.routes.datasets import binary_body, request_body
+from octasplat.service.routes.datasets import Digest, binary_body, request_body, upload_of_request
 from octasplat.service.routes.parameters import DatasetId, IdempotencyKey
 from octasplat.service.routes.response_headers import LOCATION, header, with_headers
 from octasplat.service.schemas.resumable_uploads import UploadView
@@ -75,7 +77,7 @@ async def create_upload(
     upload = await actions.create_upload(service, principal, dataset_id, new, idempotency_key=key)
     response.headers.update(_headers(upload))
     response.headers["Location"] = f"/v1/datasets/{dataset_id}/uploads/{upload.id}"
-    return UploadView.from_row(upload)
+    return UploadView.from_row(upload, await parts_ahead(service, principal, dataset_id, upload.id))
 
 
 @router.get(
@@ -95,7 +97,7 @@ async def get_upload(
     response.headers.update(_headers(upload))
     # tus asks for this, as an offset that a cache remembers is out of date.
     response.headers["Cache-Control"] = "no-store"
-    return UploadView.from_row(upload)
+    return UploadView.from_row(upload, await parts_ahead(service, principal, dataset_id, upload_id))
 
 
 @router.patch(
@@ -124,10 +126,34 @@ async def continue_upload(
     upload = await actions.continue_upload(
         service, principal, dataset_id, upload_id, offset_bytes=offset, body=request_body(request)
     )
-    headers = _headers(upload)
-    if upload.task_id is not None:
-        headers["Location"] = f"/v1/datasets/{dataset_id}/tasks/{upload.task_id}"
-    return Response(status_code=204, headers=headers)
+    return _progress_response(upload)
+
+
+@router.put(
+    "/{dataset_id}/uploads/{upload_id}/parts/{start_bytes}",
+    status_code=204,
+    responses={
+        **with_headers(204, LOCATION, _OFFSET, _EXPIRES, _TUS, description="It is kept"),
+        **problem_responses(404, 408, 409, 413, 507),
+    },
+    openapi_extra=binary_body("application/octet-stream"),
+)
+async def put_part(
+    dataset_id: DatasetId, upload_id: UploadId,
+    start_bytes: Annotated[int, Path(ge=0, lt=1 << 62, description="Where it begins in the file.")],
+    principal: Writer, service: ServiceDep, request: Request, digest: Digest = None,
+) -> Response:  # fmt: skip
+    """Send a part of an upload with its digest, in any order and over several connections at once.
+
+    Parts begin at multiples of `part_bytes` of the upload, whose digest is announced, and are as long; the
+    last one ends with the file. A repetition does nothing. With the last one that is lacking `Location`
+    names the task that stores the file in the dataset.
+    """
+    upload = await upload_parts.put_part(
+        service, principal, dataset_id, upload_id,
+        start_bytes=start_bytes, body=upload_of_request(request, digest),
+    )  # fmt: skip
+    return _progress_response(upload)
 
 
 @router.delete(
@@ -141,6 +167,14 @@ async def delete_upload(
     _check_version(version)
     await actions.delete_upload(service, principal, dataset_id, upload_id)
     return Response(status_code=204, headers={"Tus-Resumable": VERSION})
+
+
+def _progress_response(upload: FileUpload) -> Response:
+    """Return the answer to what has come of an upload."""
+    headers = _headers(upload)
+    if upload.task_id is not None:
+        headers["Location"] = f"/v1/datasets/{upload.dataset_id}/tasks/{upload.task_id}"
+    return Response(status_code=204, headers=headers)
 
 
 def _headers(upload: FileUpload) -> dict[str, str]:

@@ -4,11 +4,14 @@ import uuid
 from datetime import datetime
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from octasplat.service.schemas.base import EXAMPLE_ID, EXAMPLE_TIME, RequestBody
 from octasplat.workers.db.rows import Dataset, DatasetFile, DatasetHolds, DatasetState
 from octasplat.workers.maintenance.webhooks.addresses import MAX_URL
+
+MAX_REUSED_FILES = 1000
+"""Files that are asked for in one request."""
 
 
 class NewDataset(RequestBody):
@@ -131,6 +134,51 @@ class FileView(BaseModel):
     def from_row(cls, row: DatasetFile) -> "FileView":
         """Return the view of a database row."""
         return cls.model_validate(row, from_attributes=True)
+
+
+class FileDigest(RequestBody):
+    """A file that you have, by its digest."""
+
+    path: str = Field(min_length=1, max_length=1000, description="Its name in the dataset.")
+    sha256: str = Field(pattern="^[0-9a-f]{64}$", description="Digest of its content, in hexadecimal.")
+
+
+class FilesToReuse(RequestBody):
+    """Files that are taken without being sent, where their contents are stored for the owner already."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "examples": [
+                {
+                    "files": [
+                        {
+                            "path": "images/0001.jpg",
+                            "sha256": "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855",
+                        }
+                    ]
+                }
+            ]
+        },
+    )
+
+    files: list[FileDigest] = Field(
+        max_length=MAX_REUSED_FILES, description="What you have; each path once, 1,000 in one request."
+    )
+
+    @field_validator("files")
+    @classmethod
+    def _check_paths_differ(cls, files: list[FileDigest]) -> list[FileDigest]:
+        if len({file.path for file in files}) < len(files):
+            raise ValueError("Two of the files have the same path.")
+        return files
+
+
+class ReusedFilesView(BaseModel):
+    """Which of the files are in the dataset now, and which have to be sent."""
+
+    files: list[FileView] = Field(description="Taken from what the owner has stored.")
+    missing: list[str] = Field(description="Paths of the others; send these.")
 
 
 class FilePage(BaseModel):

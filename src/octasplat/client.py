@@ -13,6 +13,7 @@ from octasplat.notebook import default_progress, table_html
 from octasplat.paths import PathLike
 from octasplat.workers.client import submission
 from octasplat.workers.client.api import Api, ServiceError, ServiceUnreachableError, find_address, find_token
+from octasplat.workers.client.bucket import is_bucket_address
 from octasplat.workers.client.dataset_tasks import import_scene, is_web_address
 from octasplat.workers.client.submission import Derivation, JobFailedError, Submission
 
@@ -82,8 +83,8 @@ class Client:
         """Upload photographs and queue their reconstruction; uploaded photographs are not sent again.
 
         Args:
-            photographs: a folder, a ZIP file, the id of a dataset, or the https address of a ZIP file, which
-                the service fetches; None takes those of ``start_from``.
+            photographs: a folder, a ZIP file, the id of a dataset, or what the service fetches: the https
+                address of a ZIP file, or ``s3://bucket/folder``; None takes those of ``start_from``.
             start_from: a reconstruction, finished or stopped, or its id: with its Gaussians the new one
                 begins.
             label: what to call the job.
@@ -186,7 +187,8 @@ class Client:
 
 def _scene(photographs: PathLike) -> Path | str:
     """Return an address as text, anything else as a path."""
-    return str(photographs) if is_web_address(photographs) else Path(photographs)
+    is_address = is_web_address(photographs) or is_bucket_address(photographs)
+    return str(photographs) if is_address else Path(photographs)
 
 
 class Job:

@@ -140,7 +140,10 @@ def test_pauses_grow_and_end(monkeypatch: pytest.MonkeyPatch) -> None:
     assert sum(pauses) == pytest.approx(120.0) and 12 <= len(pauses) <= 30
     assert pauses[0] < 0.5 and max(pauses) <= 10.0
     waiting.reset()
-    assert waiting.wait(min_seconds=5.0) and pauses[-1] == 5.0
+    for asked in (5.0, 60.0):  # also where a service asks for more than the longest pause of its own accord
+        assert waiting.wait(min_seconds=asked) and pauses[-1] == asked
+    assert waiting.wait(min_seconds=600.0) and pauses[-1] == pytest.approx(55.0)
+    assert not waiting.wait()
 
 
 def test_redirect_raises_error_with_target(serve: Callable[..., Front], tmp_path: Path) -> None:
@@ -249,6 +252,113 @@ def test_upload_after_dataset_deletion_is_sent_once(serve: Callable[..., Front],
             for _ in range(3):
                 upload_files(api, files)
     assert service.uploads == 1 + 3
+
+
+def test_service_of_the_former_version_is_sent_all_files(serve: Callable[..., Front], tmp_path: Path) -> None:
+    service = Datasets()
+    (tmp_path / "a.obj").write_text("x")
+
+    def answer(method: str, path: str, headers: dict[str, str], body: bytes) -> Answer:
+        if method == "POST" and path.endswith("/files"):
+            return as_json({"detail": "Method Not Allowed"}, 405)
+        return service(method, path, headers, body)
+
+    with Api(serve(answer).address) as api:
+        notes: list[str] = []
+        files = dict.fromkeys(("a.obj", "b.obj"), tmp_path / "a.obj")
+        assert upload_files(api, files, on_note=notes.append)["state"] == "committed"
+    assert service.uploads == 2 and notes == []
+
+
+def test_busy_service_is_left_alone_for_as_long_as_it_asks(
+    serve: Callable[..., Front], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pauses: list[float] = []
+    monkeypatch.setattr(backoff.time, "sleep", pauses.append)
+    monkeypatch.setattr("octasplat.workers.client.dataset_files.MIN_RESUMABLE_BYTES", 1)
+    service, refusals = Datasets(), {"POST": 1, "PATCH": 1}
+    (tmp_path / "a.obj").write_text("x")
+
+    def answer(method: str, path: str, headers: dict[str, str], body: bytes) -> Answer:
+        if "/uploads" not in path:
+            task = {"id": "t", "dataset_id": "d0", "state": "succeeded", "problem": None}
+            return as_json(task) if path.endswith("/t") else service(method, path, headers, body)
+        if refusals.get(method):
+            refusals[method] -= 1
+            document = json.dumps({"detail": "Too many uploads are unfinished."}).encode()
+            return 429, {"Retry-After": "30", "Content-Type": "application/problem+json"}, document
+        if method == "POST":
+            made = json.dumps({"size_bytes": 1, "offset_bytes": 0}).encode()
+            return 201, {"Location": "/v1/datasets/d0/uploads/u"}, made
+        told = {"Upload-Offset": "1", "Location": "/v1/datasets/d0/tasks/t"}
+        return (200, {"Upload-Offset": "0"}, b"") if method == "HEAD" else (204, told, b"")
+
+    with Api(serve(answer).address) as api:
+        assert upload_files(api, {"a.obj": tmp_path / "a.obj"})["state"] == "committed"
+    assert pauses == [30.0, 30.0]
+
+
+@pytest.mark.parametrize("part_bytes", [0, 1])
+def test_file_that_was_stored_before_the_answer_to_its_last_part_was_lost(
+    serve: Callable[..., Front], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part_bytes: int
+) -> None:
+    monkeypatch.setattr("octasplat.workers.client.dataset_files.MIN_RESUMABLE_BYTES", 1)
+    service, is_stored = Datasets(), False
+    (tmp_path / "a.obj").write_text("x")
+    etag = f'"{hashlib.sha256(b"x").hexdigest()}"'
+
+    def answer(method: str, path: str, headers: dict[str, str], body: bytes) -> Answer:
+        nonlocal is_stored
+        if method == "HEAD" and path.endswith("/files/a.obj"):
+            return 200, {"ETag": etag}, b""
+        if "/uploads" not in path:
+            return service(method, path, headers, body)
+        if method == "POST":
+            made = {"size_bytes": 1, "offset_bytes": 0, "part_bytes": part_bytes}
+            return 201, {"Location": "/v1/datasets/d0/uploads/u"}, json.dumps(made).encode()
+        if is_stored:
+            return as_json({"detail": "There is no such upload."}, 404)
+        is_stored = method in ("PUT", "PATCH")
+        return as_page(502) if is_stored else (200, {"Upload-Offset": "0"}, b"")
+
+    front = serve(answer)
+    with Api(front.address) as api:
+        assert upload_files(api, {"a.obj": tmp_path / "a.obj"})["state"] == "committed"
+    assert sum(asked.startswith(("PUT", "PATCH")) for asked in front.asked) == (2 if part_bytes else 1)
+
+
+def test_large_and_small_files_share_four_connections(
+    serve: Callable[..., Front], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("octasplat.workers.client.dataset_files.MIN_RESUMABLE_BYTES", 8)
+    service, lock, now, most = Datasets(), threading.Lock(), [0], [0]
+    files = {f"{number}.obj": tmp_path / f"{number}.obj" for number in range(8)}
+    for number, path in enumerate(files.values()):
+        path.write_text("x" * (8 if number % 2 else 1))
+
+    def answer(method: str, path: str, headers: dict[str, str], body: bytes) -> Answer:
+        if path.endswith("/t"):
+            return as_json({"id": "t", "dataset_id": "d0", "state": "succeeded", "problem": None})
+        if method == "POST" and path.endswith("/uploads"):
+            made = {"size_bytes": 8, "offset_bytes": 0, "part_bytes": 1, "parts_ahead": [3]}
+            return 201, {"Location": "/v1/datasets/d0/uploads/u"}, json.dumps(made).encode()
+        if method != "PUT":
+            return service(method, path, headers, body)
+        with lock:
+            now[0] += 1
+            most[0] = max(most[0], now[0])
+        time.sleep(0.02)
+        with lock:
+            now[0] -= 1
+        return 204, {"Location": "/v1/datasets/d0/tasks/t"}, b""
+
+    told: list[int] = []
+    front = serve(answer)
+    with Api(front.address) as api:
+        assert upload_files(api, files, progress=lambda d, _t: told.append(d))["state"] == "committed"
+    assert 1 < most[0] <= 4
+    assert sum(asked.startswith("PUT") for asked in front.asked) == 4 + 4 * 7
+    assert told[-1] == max(told) == 4 * 1 + 4 * 8
 
 
 def test_commit_after_interrupted_check_succeeds(serve: Callable[..., Front], tmp_path: Path) -> None:

@@ -79,7 +79,7 @@ class Stage:
             await put_live_scene(connection, state)
         self.ids = {
             "dataset_id": open_dataset, "job_id": job_id, "path": "images/a.png", "name": "scene.ply",
-            "kind": "toy", "queue": "cpu", "worker": "box",
+            "kind": "toy", "queue": "cpu", "worker": "box", "start_bytes": "0",
         }  # fmt: skip
         hook = await self._make("/v1/webhooks", {"url": "https://example.org/hook"})
         tried = await self.http.post(f"/v1/webhooks/{hook}/test", headers=self.headers["owner"])

@@ -26,7 +26,9 @@ from octasplat.service.intake import receive
 from octasplat.service.state import Service
 from octasplat.workers.client.api import Api
 from octasplat.workers.client.upload import upload_scene
+from octasplat.workers.client.upload_parts import PARALLEL_PARTS
 from octasplat.workers.db.dataset_tasks import DatasetTask
+from octasplat.workers.db.quotas import Quota, set_quota
 from octasplat.workers.maintenance.garbage_collection import collect_garbage_now
 from octasplat.workers.maintenance.retention import apply_retention
 from octasplat.workers.settings import Retention
@@ -108,6 +110,77 @@ async def test_archive_comes_in_parts_and_is_unpacked(
         task = await task_over(http, httpx.Response(202, headers={"Location": last.headers["Location"]}))
         assert task["state"] == "succeeded" and task["result"]["files"] == len(scene), task
         assert (await http.post(f"{dataset}/commit")).status_code == 200
+
+
+async def put_part(
+    http: httpx.AsyncClient, upload: str, start: int, content: bytes, announced_as: bytes | None = None
+) -> httpx.Response:
+    digest = base64.b64encode(hashlib.sha256(announced_as or content).digest()).decode()
+    headers = {"Repr-Digest": f"sha-256=:{digest}:"}
+    return await http.put(f"{upload}/parts/{start}", content=content, headers=headers)
+
+
+async def test_parts_come_in_any_order_and_at_once(
+    connect_service: ConnectService, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(receive, "PARALLEL_PART_BYTES", 500)
+    scene = {**photographs(), **ColmapModelBuilder().files()}
+    archive = build_zip(*(ZipMember(name, content, method=0) for name, content in scene.items()))
+    starts = range(0, len(archive), 500)
+    assert len(starts) > 3
+    parts = {start: archive[start : start + 500] for start in starts}
+    async with connect_service() as (http, _):
+        dataset = await new_dataset(http)
+        upload = await new_upload(http, dataset, archive, sha256=hashlib.sha256(archive).hexdigest())
+        wrong = await put_part(http, upload, 500, parts[500], b"other")
+        assert (wrong.status_code, wrong.json()["type"]) == (422, "urn:octasplat:problem:digest-mismatch")
+        assert wrong.json()["detail"].count(". ") == 0
+        last = await asyncio.gather(*(put_part(http, upload, start, parts[start]) for start in starts[2:]))
+        assert {(a.status_code, a.headers["Upload-Offset"], a.headers.get("Location")) for a in last} == {
+            (204, "0", None)
+        }
+        assert (await put_part(http, upload, 1000, parts[1000])).status_code == 204  # its answer was lost
+        told = (await http.get(upload)).json()
+        assert (told["part_bytes"], told["offset_bytes"], told["parts_ahead"]) == (500, 0, list(starts[2:]))
+        assert (await http.get("/v1/usage")).json()["bytes"]["used"] == len(archive) - 1000
+        assert (await put_part(http, upload, 0, parts[0])).headers["Upload-Offset"] == "500"
+        other = await put_part(http, upload, 0, bytes(500))
+        assert (other.status_code, other.json()["type"]) == (409, "urn:octasplat:problem:conflict")
+        whole = await put_part(http, upload, 500, parts[500])
+        assert whole.headers["Upload-Offset"] == str(len(archive))
+        answer = httpx.Response(202, headers={"Location": whole.headers["Location"]})
+        assert (await task_over(http, answer))["state"] == "succeeded"
+        assert (await http.post(f"{dataset}/commit")).json()["has_poses"]
+
+
+async def test_part_that_does_not_fit_is_refused(
+    connect_service: ConnectService, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(receive, "PARALLEL_PART_BYTES", 1000)
+    content = bytes(2500)
+    async with connect_service(quota_bytes=2500) as (http, service):
+        dataset = await new_dataset(http)
+        plain = await new_upload(http, dataset, content, path="images/a.png")
+        upload = await new_upload(
+            http, dataset, content, path="images/a.png", sha256=hashlib.sha256(content).hexdigest()
+        )
+        assert (await put_part(http, plain, 0, content[:1000])).status_code == 409
+        for start, part in ((500, content[:1000]), (3000, b""), (2000, content[:1000]), (0, content[:999])):
+            assert (await put_part(http, upload, start, part)).status_code == 422, start
+        assert (await http.put(f"{upload}/parts/0", content=content[:1000])).status_code == 422
+        bob = await client_with_token(service, "bob", "write")
+        digest = {"Repr-Digest": f"sha-256=:{base64.b64encode(hashlib.sha256(b'x').digest()).decode()}:"}
+        foreign = await http.put(f"{upload}/parts/0", content=b"x", headers={**digest, **bob})
+        assert foreign.status_code == 404
+        assert (await http.get("/v1/usage")).json()["bytes"]["used"] == 0
+        # As tus has it, what comes in order replaces what came ahead of it.
+        assert (await put_part(http, upload, 2000, content[2000:])).status_code == 204
+        assert (await send(http, upload, 0, content[:1700])).headers["Upload-Offset"] == "1700"
+        assert (await http.get(upload)).json()["parts_ahead"] == []
+        assert (await put_part(http, upload, 1000, content[1000:2000])).status_code == 409
+        async with service.pool.connection() as connection:
+            await set_quota(connection, "local", Quota(max_bytes=1))
+        assert (await put_part(http, upload, 2000, content[2000:])).status_code == 413
 
 
 async def test_what_has_come_of_a_body_that_breaks_off_is_kept(connect_service: ConnectService) -> None:
@@ -332,15 +405,18 @@ def test_upload_goes_on_after_client_and_service_are_killed(conninfo: str, tmp_p
         client.stdout.close()
         with psycopg.connect(conninfo, autocommit=True) as connection:
 
-            def offset() -> int:
-                row = connection.execute("SELECT offset_bytes FROM uploads").fetchone()
-                return -1 if row is None else int(row[0])
+            def stored() -> int:
+                row = connection.execute("SELECT sum(size_bytes) FROM upload_parts").fetchone()
+                return -1 if row is None or row[0] is None else int(row[0])
 
+            # Of the parts that were under way nothing is kept.
+            least = size // 2 - PARALLEL_PARTS * receive.PARALLEL_PART_BYTES
             deadline = time.monotonic() + 30
-            while offset() < size // 3 and time.monotonic() < deadline:
-                time.sleep(0.1)  # until the service knows that nothing more comes
-            kept = offset()
-            assert size // 3 < kept < size
+            while stored() < least and time.monotonic() < deadline:
+                time.sleep(0.1)
+            time.sleep(1.0)  # until the service knows that nothing more comes
+            kept = stored()
+            assert least <= kept < size
             told: list[int] = []
             killed = threading.Event()
 
@@ -357,7 +433,7 @@ def test_upload_goes_on_after_client_and_service_are_killed(conninfo: str, tmp_p
             assert killed.is_set()
             assert told[1] >= kept  # after the start at 0 it goes on there
             assert (dataset["state"], dataset["photographs"]) == ("committed", 3)
-            assert offset() == -1
+            assert stored() == -1
             row = connection.execute("SELECT sum(size_bytes) FROM dataset_files").fetchone()
             assert row is not None and size - 1000 < row[0] < size
         repeated = sum(max(0, before - after) for before, after in pairwise(told))

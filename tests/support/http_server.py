@@ -16,7 +16,7 @@ class QuietHandler(BaseHTTPRequestHandler):
     def _respond(self) -> None:
         self.respond()
 
-    do_GET = do_POST = do_PUT = do_DELETE = _respond
+    do_GET = do_HEAD = do_POST = do_PUT = do_PATCH = do_DELETE = _respond
 
     def answer(self, content: bytes, status: int = 200, **headers: str) -> None:
         """Send a whole answer."""

@@ -15,7 +15,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 class SceneName(click.Path):
-    """A scene: a path, or the address of a ZIP file, which stays text."""
+    """A scene: a path, or the address of a ZIP file or of a folder in a bucket, which stays text."""
 
     name = "scene"
 
@@ -24,9 +24,11 @@ class SceneName(click.Path):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the path, or the address."""
+        from octasplat.workers.client.bucket import is_bucket_address
         from octasplat.workers.client.dataset_tasks import is_web_address
 
-        return value if is_web_address(value) else super().convert(value, param, ctx)
+        is_address = is_web_address(value) or is_bucket_address(value)
+        return value if is_address else super().convert(value, param, ctx)
 
 
 def server_option(command: F) -> F:

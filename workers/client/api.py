@@ -23,12 +23,19 @@ _TIMEOUT = httpx.Timeout(60.0, connect=10.0)
 
 
 class ServiceError(OctasplatError):
-    """The service refused something; ``status`` is that of the answer, ``errors`` single faults."""
+    """The service refused something.
+
+    Attributes:
+        status: of the answer.
+        errors: single faults.
+        retry_seconds: for how long the service asks to be left alone, s; 0 where it does not say.
+    """
 
     def __init__(self, message: str, status: int = 0, errors: tuple[Mapping[str, Any], ...] = ()) -> None:
         super().__init__(message)
         self.status = status
         self.errors = errors
+        self.retry_seconds = 0.0
 
 
 class ServiceUnreachableError(OctasplatError):
@@ -220,7 +227,9 @@ class Api:
             return response
         if response.status_code in UNAVAILABLE_STATUSES and not _is_from_service(response):
             raise self.unreachable_error(f"a proxy answers {response.status_code}")
-        raise _service_error(response)
+        error = _service_error(response)
+        error.retry_seconds = _retry_after(response)
+        raise error
 
 
 def _is_from_service(response: httpx.Response) -> bool:

@@ -39,7 +39,7 @@ class Backoff:
         if left <= 0:
             return False
         # Not all who wait come back in the same moment.
-        pause = max(self._pause * random.uniform(0.75, 1.25), min_seconds)  # noqa: S311
-        time.sleep(min(pause, MAX_PAUSE_SECONDS, left))
+        pause = min(self._pause * random.uniform(0.75, 1.25), MAX_PAUSE_SECONDS)  # noqa: S311
+        time.sleep(min(max(pause, min_seconds), left))
         self._pause = min(2 * self._pause, MAX_PAUSE_SECONDS)
         return True

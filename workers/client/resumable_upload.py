@@ -1,9 +1,14 @@
-"""One large file to a dataset, over breaks of the connection, the service and this process (tus 1.0.0)."""
+"""One large file to a dataset, over breaks of the connection, the service and this process.
+
+Its parts go over several connections at once; a service of the former version gets them in order (tus 1.0.0).
+"""
 
 import base64
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
+from threading import Semaphore
+from urllib.parse import quote
 
 import httpx
 
@@ -15,6 +20,7 @@ from octasplat.workers.client.api import (
     ServiceUnreachableError,
 )
 from octasplat.workers.client.dataset_tasks import wait_for_task
+from octasplat.workers.client.upload_parts import PARALLEL_PARTS, FileRange, Upload, send_parts
 
 MIN_RESUMABLE_BYTES = 32 << 20
 """Smaller files are sent in one request, and again from their beginning."""
@@ -22,7 +28,6 @@ REQUEST_BYTES = 256 << 20
 """Most that one request sends, as proxies limit the time of one."""
 MAX_STORED_BEFORE = 30
 """So often the same file may have been sent to the same dataset before, and removed there."""
-_PIECE_BYTES = 1 << 20
 _VERSION = {"Tus-Resumable": "1.0.0"}
 _CONFLICT, _NOT_FOUND = httpx.codes.CONFLICT, httpx.codes.NOT_FOUND
 
@@ -34,6 +39,7 @@ def send_resumable(
     name: str | None,
     sha256: str,
     progress: Callable[[int], None] = lambda _done: None,
+    connections: Semaphore | None = None,
 ) -> None:
     """Send a file and wait until it is stored; the same call again goes on with what has arrived.
 
@@ -44,13 +50,49 @@ def send_resumable(
         name: what it is called there; None for a ZIP file that is unpacked.
         sha256: its digest.
         progress: called with the bytes that have gone out.
+        connections: taken for each part, as other files may be sent meanwhile; by default of its own.
 
     Raises:
         ServiceError: the service refuses it.
         ServiceUnreachableError: the service was away for too long.
     """
-    size = path.stat().st_size
-    address = _find_or_create(api, dataset_id, name, sha256, size)
+    upload = _find_or_create(api, dataset_id, name, sha256, path.stat().st_size)
+    task = None
+    try:
+        if upload.can_take_parts:
+            task = send_parts(api, upload, path, progress, connections or Semaphore(PARALLEL_PARTS))
+        if task is None:
+            task = _send_in_order(api, upload, path, progress)
+    except ServiceError as error:
+        # The answer to the last part was lost, and the file was stored before it was asked for again.
+        if error.status == _NOT_FOUND and _is_stored(api, dataset_id, name, sha256):
+            return
+        raise
+    wait_for_task(api, api.get(task))
+
+
+def _is_stored(api: Api, dataset_id: str, name: str | None, sha256: str) -> bool:
+    """Return whether a dataset has a file, or what was in a ZIP file, whose upload is over.
+
+    Raises:
+        ServiceError: the content of the ZIP file was refused.
+    """
+    if name is None:
+        # An archive is sent to a dataset of its own.
+        tasks = api.get(f"/v1/datasets/{dataset_id}/tasks", limit=1)["tasks"]
+        return bool(tasks) and tasks[0]["kind"] == "upload" and bool(wait_for_task(api, tasks[0]))
+    try:
+        answer = api.request("HEAD", f"/v1/datasets/{dataset_id}/files/{quote(name)}")
+    except ServiceError as error:
+        if error.status != _NOT_FOUND:
+            raise
+        return False
+    return answer.headers.get("ETag") == f'"{sha256}"'
+
+
+def _send_in_order(api: Api, upload: Upload, path: Path, progress: Callable[[int], None]) -> str:
+    """Send what is lacking of a file behind what has come; returns the address of the task that stores it."""
+    address, size = upload.address, upload.size_bytes
     patience = api.new_backoff()
     offset, task = _offset(api, address), None
     while task is None:
@@ -61,15 +103,17 @@ def send_resumable(
             "Content-Type": "application/offset+octet-stream",
             "Content-Length": str(min(REQUEST_BYTES, size - offset)),
         }
+        content = FileRange(path, offset, min(offset + REQUEST_BYTES, size), progress)
         try:
-            response = api.send("PATCH", address, headers=headers, content=_pieces(path, offset, progress))
+            response = api.send("PATCH", address, headers=headers, content=content)
         except (httpx.TransportError, ServiceUnreachableError) as error:
             if not patience.wait():
                 raise api.unreachable_error(error) from None
             reached = _offset(api, address)
         except ServiceError as error:
             # Another connection, perhaps that of before, has brought more; or it is to be repeated.
-            if error.status not in {_CONFLICT, *BUSY_STATUSES, *UNAVAILABLE_STATUSES} or not patience.wait():
+            is_passing = error.status in {_CONFLICT, *BUSY_STATUSES, *UNAVAILABLE_STATUSES}
+            if not is_passing or not patience.wait(error.retry_seconds):
                 raise
             reached = _offset(api, address)
         else:
@@ -78,11 +122,11 @@ def send_resumable(
             # An outage after progress is a new one, with all of its time.
             patience = api.new_backoff()
         offset = reached
-    wait_for_task(api, api.get(task))
+    return str(task)
 
 
-def _find_or_create(api: Api, dataset_id: str, name: str | None, sha256: str, size: int) -> str:
-    """Return the address of the upload of this file, a new one unless one is under way."""
+def _find_or_create(api: Api, dataset_id: str, name: str | None, sha256: str, size: int) -> Upload:
+    """Return the upload of this file, a new one unless one is under way."""
     metadata = {"sha256": sha256} if name is None else {"path": name, "sha256": sha256}
     encoded = (f"{key} {base64.b64encode(value.encode()).decode()}" for key, value in metadata.items())
     headers = {**_VERSION, "Upload-Length": str(size), "Upload-Metadata": ",".join(encoded)}
@@ -95,20 +139,9 @@ def _find_or_create(api: Api, dataset_id: str, name: str | None, sha256: str, si
             if error.status != _NOT_FOUND:  # it was stored or given up since, and the next one may be there
                 raise
         else:
-            return str(response.headers["Location"])
+            return Upload.from_answer(str(response.headers["Location"]), response.json())
     raise ServiceError(f"The file was sent {MAX_STORED_BEFORE} times before; make a new dataset.")
 
 
 def _offset(api: Api, address: str) -> int:
     return int(api.request("HEAD", address, headers=_VERSION).headers["Upload-Offset"])
-
-
-def _pieces(path: Path, offset: int, progress: Callable[[int], None]) -> Iterator[bytes]:
-    """Yield the content that one request sends."""
-    end = offset + REQUEST_BYTES
-    with path.open("rb") as handle:
-        handle.seek(offset)
-        while offset < end and (piece := handle.read(min(_PIECE_BYTES, end - offset))):
-            yield piece
-            offset += len(piece)
-            progress(offset)

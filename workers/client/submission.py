@@ -15,6 +15,7 @@ from octasplat.engine.pathtracing.stage.stage_file import read_stage, referenced
 from octasplat.engine.render.path_document import read_path_document
 from octasplat.engine.settings.nested_options import merge_options
 from octasplat.workers.client.api import Api
+from octasplat.workers.client.bucket import import_bucket, is_bucket_address
 from octasplat.workers.client.dataset_tasks import import_scene, is_web_address
 from octasplat.workers.client.download import download_archive, download_results
 from octasplat.workers.client.upload import upload_files, upload_scene
@@ -32,8 +33,8 @@ class Submission:
     """Description of a job to submit.
 
     Attributes:
-        scene: folder of photographs, ZIP file, the id of a dataset, or the address of a ZIP file, as text;
-            None takes the photographs of ``start_from``.
+        scene: folder of photographs, ZIP file, the id of a dataset, or as text the address of a ZIP file, or
+            of a folder in a bucket; None takes the photographs of ``start_from``.
         options: of the reconstruction.
         label: what to call the job.
         queue: which workers.
@@ -57,7 +58,8 @@ def submit(api: Api, submission: Submission, on_event: EventListener = ignore_ev
     Args:
         api: the service.
         submission: the scene and what to do with it.
-        on_event: receives the stage ``upload``, whose steps are kB, and of what the service warns of.
+        on_event: receives the stage ``upload``, whose steps are kB, what was not sent, and what the service
+            warns of.
 
     Raises:
         OctasplatError: the scene or the options are refused, or the service does not answer.
@@ -189,7 +191,11 @@ def derive(api: Api, derivation: Derivation, on_event: EventListener = ignore_ev
     if derivation.files:
         with counted_phase("upload", on_event) as progress:
             sent = upload_files(
-                api, derivation.files, name="stage", progress=lambda d, t: progress(d >> 10, t >> 10)
+                api,
+                derivation.files,
+                name="stage",
+                progress=lambda d, t: progress(d >> 10, t >> 10),
+                on_note=lambda sentence: on_event(Noted(sentence)),
             )
         body["files_id"] = sent["id"]
     job: dict[str, Any] = api.post("/v1/jobs", body)
@@ -265,12 +271,24 @@ def _upload_if_needed(api: Api, scene: Path | str, on_event: EventListener, sha2
     if isinstance(scene, str) and is_web_address(scene):
         on_event(Noted(f"The service fetches {scene}."))
         return _id_with_notes(import_scene(api, scene, sha256=sha256), on_event)
+    if isinstance(scene, str) and is_bucket_address(scene):
+        on_event(Noted(f"The service fetches {scene}."))
+        with counted_phase("upload", on_event) as progress:
+            dataset = import_bucket(
+                api,
+                scene,
+                sha256=sha256,
+                progress=lambda d, t: progress(d >> 10, t >> 10),
+                on_warning=lambda sentence: on_event(Warned(sentence)),
+            )
+        return _id_with_notes(dataset, on_event)
     with counted_phase("upload", on_event) as progress:
         dataset = upload_scene(
             api,
             Path(scene),
             progress=lambda d, t: progress(d >> 10, t >> 10),
             on_warning=lambda sentence: on_event(Warned(sentence)),
+            on_note=lambda sentence: on_event(Noted(sentence)),
         )
     return _id_with_notes(dataset, on_event)
 

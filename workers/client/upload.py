@@ -1,40 +1,28 @@
-"""A folder of photographs to a dataset; what has arrived before is not sent again."""
+"""A folder of photographs, or a ZIP file, to a dataset; what has arrived before is not sent again."""
 
-import base64
 import hashlib
-import threading
-import urllib.parse
-import uuid
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.scene_layout import is_ignored_file
-from octasplat.workers.client.api import Api, ServiceError
+from octasplat.workers.client.api import Api
+from octasplat.workers.client.dataset_files import (
+    LocalFile,
+    create_dataset_once,
+    describe_unsent,
+    put_file,
+    send_files,
+    sha256_of,
+)
 from octasplat.workers.client.dataset_tasks import commit
 from octasplat.workers.client.resumable_upload import MIN_RESUMABLE_BYTES, send_resumable
 
-PARALLEL_UPLOADS = 4
-MAX_DELETED_DATASETS = 30
-"""So many datasets of one folder that were deleted are looked past for one that is there."""
-_PIECE_BYTES = 1 << 20
 _ARCHIVE_END_BYTES = 1 << 18
 """So much of the end of an archive is shown first; it holds the names of a thousand files."""
 _ARCHIVE_END_TRIES = 4
 """The list of contents may ask for more three times: its end record, that of ZIP64, and itself."""
-
-
-@dataclass(frozen=True)
-class LocalFile:
-    """A file to send: its name in the dataset and where it is."""
-
-    name: str
-    path: Path
-    size_bytes: int
 
 
 def list_scene_files(
@@ -55,13 +43,36 @@ def list_scene_files(
         for name, path in paths.items()
         if not is_ignored_file(name)
     ]
-    preview = api.post("/v1/scene-previews", {"files": listed})
-    _tell_preview(scene, preview, on_warning)
-    files = [LocalFile(file["name"], paths[file["path"]], file["size_bytes"]) for file in preview["files"]]
+    taken = preview_files(api, str(scene), listed, on_warning)
+    files = [LocalFile(file["name"], paths[file["path"]], file["size_bytes"]) for file in taken]
     for file in files:
         if _replace_non_utf8(str(file.path)) != str(file.path):
             raise DatasetError(f"The name of {str(file.path)!a} is not UTF-8; rename the file.")
     return files
+
+
+def preview_files(
+    api: Api, scene: str, listed: Sequence[Mapping[str, Any]], on_warning: Callable[[str], None]
+) -> list[dict[str, Any]]:
+    """Return which of the listed files the service takes; what it leaves out is told.
+
+    Args:
+        api: the service.
+        scene: what the files are of, for the error.
+        listed: ``path`` and ``size_bytes`` of each file.
+        on_warning: called with a sentence on which files are left out.
+
+    Returns:
+        ``name`` in the dataset, ``path`` and ``size_bytes`` of each.
+
+    Raises:
+        DatasetError: the service would refuse them.
+        ServiceError: the service cannot be asked.
+    """
+    preview = api.post("/v1/scene-previews", {"files": listed})
+    _tell_preview(scene, preview, on_warning)
+    taken: list[dict[str, Any]] = preview["files"]
+    return taken
 
 
 def _replace_non_utf8(name: str) -> str:
@@ -87,10 +98,10 @@ def _preview_archive(api: Api, archive: Path, on_warning: Callable[[str], None])
         needed = preview["needed_bytes"]
         if needed is None or needed <= len(end):
             break
-    _tell_preview(archive, preview, on_warning)
+    _tell_preview(str(archive), preview, on_warning)
 
 
-def _tell_preview(scene: Path, preview: Mapping[str, Any], on_warning: Callable[[str], None]) -> None:
+def _tell_preview(scene: str, preview: Mapping[str, Any], on_warning: Callable[[str], None]) -> None:
     for sentence in preview["notes"]:
         on_warning(sentence)
     if preview["refusals"]:
@@ -105,8 +116,11 @@ def upload_scene(
     name: str | None = None,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
     on_warning: Callable[[str], None] = lambda _sentence: None,
+    on_note: Callable[[str], None] = lambda _sentence: None,
 ) -> dict[str, Any]:
     """Send a scene and commit it; the same command again goes on with the same dataset.
+
+    Of a folder only those files are sent that no dataset of the same owner holds.
 
     Args:
         api: the service.
@@ -114,6 +128,7 @@ def upload_scene(
         name: what to call it; by default as the folder.
         progress: called with (bytes done, total).
         on_warning: called with a sentence on which files are left out, before anything is sent.
+        on_note: called with a sentence on what was not sent, as the service has it.
 
     Returns:
         The dataset.
@@ -129,11 +144,10 @@ def upload_scene(
     else:
         files = list_scene_files(api, scene, on_warning)
     dataset = _find_or_create_dataset(api, name or scene.resolve().stem, files)
-    if dataset["state"] == "open":
-        if is_archive:
-            _send_archive(api, dataset["id"], files[0], progress)
-        else:
-            _send_missing(api, dataset["id"], files, progress)
+    if is_archive and dataset["state"] == "open":
+        _send_archive(api, dataset["id"], files[0], progress)
+    else:
+        _send_folder(api, dataset, files, progress, on_note)
     return commit(api, dataset)
 
 
@@ -143,6 +157,7 @@ def upload_files(
     *,
     name: str = "",
     progress: Callable[[int, int], None] = lambda _done, _total: None,
+    on_note: Callable[[str], None] = lambda _sentence: None,
 ) -> dict[str, Any]:
     """Send files that the options of a job name; the same call again goes on with the same dataset.
 
@@ -151,6 +166,7 @@ def upload_files(
         files: where they are, by the names that the options call them.
         name: what to call the dataset.
         progress: called with (bytes done, total).
+        on_note: called with a sentence on what was not sent, as the service has it.
 
     Returns:
         The dataset, committed; a job gets it as ``files_id``.
@@ -160,8 +176,7 @@ def upload_files(
     """
     local = [LocalFile(called, path, path.stat().st_size) for called, path in sorted(files.items())]
     dataset = _find_or_create_dataset(api, name, local, holds="files")
-    if dataset["state"] == "open":
-        _send_missing(api, dataset["id"], local, progress)
+    _send_folder(api, dataset, local, progress, on_note)
     return commit(api, dataset)
 
 
@@ -175,120 +190,27 @@ def _find_or_create_dataset(
         facts = file.path.stat()
         digest.update(f"{file.name}\0{facts.st_size}\0{facts.st_mtime_ns}\0{facts.st_ino}\n".encode())
     body = {"name": name, "holds": holds} if holds == "files" else {"name": name}
-    key = f"scene-{digest.hexdigest()}"
-    for number in range(MAX_DELETED_DATASETS):
-        try:
-            found: dict[str, Any] = api.post("/v1/datasets", body, key=f"{key}-{number}" if number else key)
-        except ServiceError as error:
-            if error.status != 404:  # it was deleted since, and the next one may be there
-                raise
-        else:
-            return found
-    made: dict[str, Any] = api.post("/v1/datasets", body, key=uuid.uuid4().hex)
-    return made
+    return create_dataset_once(api, body, f"scene-{digest.hexdigest()}")
 
 
-def _send_missing(
-    api: Api, dataset_id: str, files: list[LocalFile], progress: Callable[[int, int], None]
+def _send_folder(
+    api: Api,
+    dataset: Mapping[str, Any],
+    files: Sequence[LocalFile],
+    progress: Callable[[int, int], None],
+    on_note: Callable[[str], None],
 ) -> None:
-    there = {f["path"]: f for f in api.iterate_pages(f"/v1/datasets/{dataset_id}/files", "files", limit=5000)}
-    names = {file.name for file in files}
-    # What an earlier try has sent and the folder does not hold any more.
-    for path in there.keys() - names:
-        try:
-            api.request("DELETE", _file_address(dataset_id, path))
-        except ServiceError as error:
-            if error.status != 404:  # an earlier try, whose answer was lost, has removed it
-                raise
-    counter = _ProgressCounter(sum(file.size_bytes for file in files), progress)
-
-    def send(file: LocalFile) -> None:
-        sha256 = _sha256(file.path)
-        known = there.get(file.name)
-        is_there = known is not None and known["sha256"] == sha256
-        if not is_there and file.size_bytes >= MIN_RESUMABLE_BYTES:
-            with counter.part() as tell:
-                send_resumable(api, dataset_id, file.path, file.name, sha256, tell)
-        elif not is_there:
-            _put_file(api, _file_address(dataset_id, file.name), file.path, sha256)
-        counter.add(file.size_bytes)
-
-    with ThreadPoolExecutor(PARALLEL_UPLOADS) as pool:
-        jobs = [pool.submit(send, file) for file in files]
-        try:
-            done, _ = wait(jobs, return_when=FIRST_EXCEPTION)
-        finally:
-            # What is being sent is sent to its end; what has not begun does not begin.
-            pool.shutdown(wait=True, cancel_futures=True)
-    for job in done:
-        job.result()
+    """Send the files that are lacking, and note those that are not; a dataset that is closed has them all."""
+    unsent = send_files(api, dataset["id"], files, progress) if dataset["state"] == "open" else files
+    if (sentence := describe_unsent(unsent, len(files))) is not None:
+        on_note(sentence)
 
 
 def _send_archive(api: Api, dataset_id: str, file: LocalFile, progress: Callable[[int, int], None]) -> None:
     progress(0, file.size_bytes)
-    sha256 = _sha256(file.path)
+    sha256 = sha256_of(file.path)
     if file.size_bytes >= MIN_RESUMABLE_BYTES:
         send_resumable(api, dataset_id, file.path, None, sha256, lambda done: progress(done, file.size_bytes))
     else:
-        _put_file(api, f"/v1/datasets/{dataset_id}/archive", file.path, sha256)
+        put_file(api, f"/v1/datasets/{dataset_id}/archive", file.path, sha256)
     progress(file.size_bytes, file.size_bytes)
-
-
-def _put_file(api: Api, address: str, path: Path, sha256: str) -> Any:
-    encoded = base64.b64encode(bytes.fromhex(sha256)).decode()
-    headers = {
-        "Repr-Digest": f"sha-256=:{encoded}:",
-        "Content-Type": "application/octet-stream",
-        "Content-Length": str(path.stat().st_size),
-    }
-    return api.request("PUT", address, content=_RereadableFile(path), headers=headers)
-
-
-class _RereadableFile:
-    """A file's content that can be sent again when the first try breaks off."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def __iter__(self) -> Iterator[bytes]:
-        with self._path.open("rb") as handle:
-            while piece := handle.read(_PIECE_BYTES):
-                yield piece
-
-
-class _ProgressCounter:
-    def __init__(self, total: int, progress: Callable[[int, int], None]) -> None:
-        self._done, self._total, self._progress = 0, total, progress
-        self._lock = threading.Lock()
-        progress(0, total)
-
-    @contextmanager
-    def part(self) -> Iterator[Callable[[int], None]]:
-        """Yield what tells how much of a file has gone out, which counts until the file is there."""
-        reported = 0
-
-        def tell(done: int) -> None:
-            nonlocal reported
-            self.add(done - reported)
-            reported = done
-
-        try:
-            yield tell
-        finally:
-            # send() counts the whole file when it is there.
-            tell(0)
-
-    def add(self, count: int) -> None:
-        """Count bytes that have gone out."""
-        with self._lock:
-            self._done += count
-            self._progress(self._done, self._total)
-
-
-def _file_address(dataset_id: str, name: str) -> str:
-    return f"/v1/datasets/{dataset_id}/files/{urllib.parse.quote(name)}"
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as handle:
-        return hashlib.file_digest(handle, "sha256").hexdigest()

@@ -7,7 +7,7 @@ bytes as they change (``migrations/0012_locks.sql``), so the time of a check doe
 stored.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Literal, LiteralString
 
@@ -138,6 +138,15 @@ async def owned_bytes(connection: Connection, owner: str, sha256: str) -> int:
         SELECT coalesce(sum(size_bytes), 0)::bigint AS n FROM owner_contents WHERE owner = %s AND sha256 = %s
         """
     return await _query_number(connection, query, [owner, sha256])
+
+
+async def owned_contents(connection: Connection, owner: str, contents: Collection[str]) -> dict[str, int]:
+    """Return the lengths of those contents, by digest, that an owner has."""
+    cursor = await connection.execute(
+        "SELECT sha256, size_bytes FROM owner_contents WHERE owner = %s AND sha256 = ANY(%s)",
+        [owner, list(contents)],
+    )
+    return {row["sha256"]: row["size_bytes"] for row in await cursor.fetchall()}
 
 
 async def check_bytes(connection: Connection, owner: str, default: Quota = NO_QUOTA) -> None:

@@ -113,6 +113,62 @@ async def add_part(connection: Connection, upload: FileUpload, part: UploadPart)
     )
     if not cursor.rowcount:
         raise ConflictError("The upload was continued by somebody else; ask for its offset.")
+    # Those that came out of order may begin within this one.
+    await connection.execute(
+        "DELETE FROM upload_parts WHERE upload_id = %s AND start_bytes >= %s", [upload.id, part.start_bytes]
+    )
+    await _insert_part(connection, upload, part)
+
+
+async def put_part(connection: Connection, upload: FileUpload, part: UploadPart) -> None:
+    """Put a part anywhere behind what has come in order; a repetition of one that has come changes nothing.
+
+    Raises:
+        ConflictError: other content has come there, or the upload is gone.
+    """
+    await lock_owner(connection, upload.owner)
+    found = await get_upload(connection, upload.id, lock=True)
+    if found is None:
+        raise ConflictError("The upload is over; begin another one.")
+    known = await fetch_one(
+        connection,
+        UploadPart,
+        "SELECT {} FROM upload_parts WHERE upload_id = %s AND start_bytes = %s",
+        [upload.id, part.start_bytes],
+    )
+    if known != part:
+        if part.start_bytes < found.offset_bytes:
+            raise ConflictError(f"{found.offset_bytes} bytes of the upload have come; go on behind them.")
+        # Replaced by two statements, as both the one that goes and the one that comes are counted.
+        await connection.execute(
+            "DELETE FROM upload_parts WHERE upload_id = %s AND start_bytes = %s",
+            [upload.id, part.start_bytes],
+        )
+        await _insert_part(connection, upload, part)
+    offset = found.offset_bytes
+    for start, size in await parts_ahead(connection, found):
+        if start != offset:
+            break
+        offset += size
+    await connection.execute(
+        "UPDATE uploads SET offset_bytes = %s, expires_at = now() + make_interval(hours => %s) WHERE id = %s",
+        [offset, KEPT_HOURS, upload.id],
+    )
+
+
+async def parts_ahead(connection: Connection, upload: FileUpload) -> list[tuple[int, int]]:
+    """Return where parts begin that have come out of order, with their lengths, in their order."""
+    cursor = await connection.execute(
+        """
+        SELECT start_bytes, size_bytes FROM upload_parts
+        WHERE upload_id = %s AND start_bytes >= %s ORDER BY start_bytes
+        """,
+        [upload.id, upload.offset_bytes],
+    )
+    return [(row["start_bytes"], row["size_bytes"]) for row in await cursor.fetchall()]
+
+
+async def _insert_part(connection: Connection, upload: FileUpload, part: UploadPart) -> None:
     await connection.execute(
         """
         INSERT INTO upload_parts (upload_id, start_bytes, owner, sha256, size_bytes)

@@ -164,6 +164,18 @@ async def unmark_for_removal(connection: Connection, contents: Collection[str]) 
     await connection.execute("DELETE FROM removing_contents WHERE sha256 = ANY(%s)", [list(contents)])
 
 
+async def contents_being_removed(connection: Connection, contents: Collection[str]) -> set[str]:
+    """Return which of these contents are marked for removal at present."""
+    cursor = await connection.execute(
+        """
+        SELECT sha256 FROM removing_contents
+        WHERE sha256 = ANY(%s) AND since > clock_timestamp() - make_interval(secs => %s)
+        """,
+        [list(contents), MAX_REMOVAL_SECONDS],
+    )
+    return {row["sha256"] for row in await cursor.fetchall()}
+
+
 async def oldest_lease(connection: Connection) -> datetime | None:
     """Return when the oldest lease in force was made; None if nobody stores anything."""
     cursor = await connection.execute("SELECT min(began_at) AS began_at FROM storing")

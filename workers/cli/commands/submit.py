@@ -64,6 +64,7 @@ def submit(
 
     The same command goes on with an upload that broke off. The service itself fetches a ZIP file from a
     public https address: octasplat submit https://example.org/fox.zip
+    So it does with photographs in a bucket of yours: octasplat submit s3://bucket/fox
 
     With --start-from a training goes on from where another is, with other options:
     octasplat submit --start-from last --preset high

@@ -1,0 +1,97 @@
+"""A scene in a bucket, which the service fetches by addresses that hold for some hours."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import boto3
+import psycopg
+import pytest
+from click.testing import CliRunner
+
+import octasplat as osp
+from octasplat.engine.core.errors import ConfigError, DatasetError
+from octasplat.workers.cli.main import cli
+from octasplat.workers.client.api import Api, ServiceError
+from octasplat.workers.client.bucket import Bucket, import_bucket
+from tests.support.front_end import FrontEnd
+from tests.support.model_builder import ColmapModelBuilder, photograph, photographs
+from tests.support.zip_builder import ZipMember, build_zip
+
+SCENE = {**photographs(), **ColmapModelBuilder().files()}
+
+
+@pytest.fixture
+def place(s3_address: str, s3_bucket: str, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Address of a scene in a bucket, with a file beside that is no part of one."""
+    monkeypatch.setenv("AWS_ENDPOINT_URL_S3", s3_address)
+    client = boto3.client("s3")
+    for name, content in {**SCENE, "notes.md": b"x", "images/.DS_Store": b"x"}.items():
+        client.put_object(Bucket=s3_bucket, Key=f"captures/fox/{name}", Body=content)
+    archive = build_zip(*(ZipMember(name, content) for name, content in SCENE.items()))
+    client.put_object(Bucket=s3_bucket, Key="captures/archive.zip", Body=archive)
+    client.put_object(Bucket=s3_bucket, Key="captures/foxes/images/a.png", Body=photograph())
+    client.close()
+    return f"s3://{s3_bucket}/captures/fox"
+
+
+@pytest.fixture
+def front(conninfo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FrontEnd]:
+    with FrontEnd(conninfo, tmp_path / "data", OCTASPLAT_IMPORT_HOSTS="127.0.0.1") as started:
+        monkeypatch.setenv("OCTASPLAT_SERVER", started.address)
+        monkeypatch.setenv("OCTASPLAT_TOKEN", started.token)
+        yield started
+
+
+def tasks(conninfo: str) -> int:
+    with psycopg.connect(conninfo) as connection:
+        row = connection.execute("SELECT count(*) FROM dataset_tasks WHERE kind = 'import'").fetchone()
+    assert row is not None
+    return int(row[0])
+
+
+def test_folder_of_a_bucket_is_fetched_checked_and_queued(front: FrontEnd, place: str, conninfo: str) -> None:
+    told = CliRunner().invoke(cli, ["submit", place, "--preset", "fast", "--json"])
+    assert told.exit_code == 0, told.output
+    assert "left out (notes.md)" in told.stderr
+    with Api(front.address, front.token) as api:
+        dataset = api.get(f"/v1/datasets/{json.loads(told.stdout)['dataset_id']}")
+        assert (dataset["name"], dataset["state"], dataset["has_poses"]) == ("fox", "committed", True)
+        files = api.get(f"/v1/datasets/{dataset['id']}/files")["files"]
+        assert [file["path"] for file in files] == sorted(SCENE)
+    assert tasks(conninfo) == len(SCENE)
+    with osp.Client() as client:
+        again = client.submit(place)
+    assert again.content["dataset_id"] == dataset["id"] and tasks(conninfo) == len(SCENE)
+
+
+def test_fetching_from_a_bucket_goes_on_where_it_was(front: FrontEnd, place: str, conninfo: str) -> None:
+    bucket = Bucket(place)
+    with Api(front.address, front.token) as api:
+        dataset = import_bucket(api, place)
+        with psycopg.connect(conninfo, autocommit=True) as connection:
+            connection.execute("UPDATE datasets SET state = 'open', committed_at = NULL")
+            connection.execute("DELETE FROM dataset_files WHERE path = 'images/v2.png'")
+        assert import_bucket(api, place)["id"] == dataset["id"]
+        assert tasks(conninfo) == len(SCENE) + 1
+        bucket._client.put_object(Bucket=bucket.name, Key="captures/fox/images/v2.png", Body=b"no picture")
+        with pytest.raises(ServiceError, match=r"images/v2\.png"):
+            import_bucket(api, place)
+    bucket.close()
+
+
+def test_archive_of_a_bucket_is_fetched_and_what_is_not_there_is_told(front: FrontEnd, place: str) -> None:
+    with Api(front.address, front.token) as api:
+        archive = place.replace("/fox", "/archive.zip")
+        assert import_bucket(api, archive)["photographs"] == len(photographs())
+        with pytest.raises(ConfigError, match="ZIP file"):
+            import_bucket(api, place, sha256="0" * 64)
+        with pytest.raises(DatasetError, match="holds no files"):
+            import_bucket(api, f"{place}/nothing")
+    for address, words in (
+        ("s3://no-such-bucket/fox", "cannot be read (NoSuchBucket)"),
+        ("s3:///fox", "is no bucket"),
+        (f"{place}?endpoint_url=nowhere", "cannot be reached"),
+    ):
+        told = CliRunner().invoke(cli, ["submit", address])
+        assert told.exit_code != 0 and words in told.stderr, told.output
