@@ -95,3 +95,23 @@ def test_archive_of_a_bucket_is_fetched_and_what_is_not_there_is_told(front: Fro
     ):
         told = CliRunner().invoke(cli, ["submit", address])
         assert told.exit_code != 0 and words in told.stderr, told.output
+
+
+def test_folder_with_odd_characters_in_its_name_is_that_folder(front: FrontEnd, place: str) -> None:
+    """And not the one whose name is what comes before the first of them."""
+    odd = "fox#2 %23+é"
+    bucket = Bucket(place)
+    for name in ("a b.png", "c+d%20#e.png", "'(é)!~&=@,.png"):
+        bucket._client.put_object(
+            Bucket=bucket.name, Key=f"captures/{odd}/images/{name}", Body=next(iter(SCENE.values()))
+        )
+    bucket.close()
+    with Api(front.address, front.token) as api:
+        dataset = import_bucket(api, place.replace("fox", odd))
+        assert (dataset["name"], dataset["photographs"]) == (odd, 3)
+    for address in (f"{place}?/images", f"{place}?", f"{place}?endpoint_url=https://x&key=1"):
+        with pytest.raises(ConfigError, match="question mark"):
+            Bucket(address)
+    for address in ("s3://[x/fox", "s3://a:b/fox"):
+        told = CliRunner().invoke(cli, ["submit", address])
+        assert told.exit_code == 1 and "unexpected" not in told.stderr, told.output

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs
 
 from octasplat.engine.core.errors import ConfigError, DatasetError
 from octasplat.engine.core.scene_layout import is_ignored_file
@@ -53,16 +53,24 @@ class Bucket:
     """
 
     def __init__(self, address: str) -> None:
-        parts = urlsplit(address)
-        if not parts.netloc or parts.username:
-            raise ConfigError(f"{parts.scheme}://... is no bucket; write s3://bucket/prefix.")
+        # Names of objects may hold what ends the path of a web address, as in scan#2.
+        place, mark, query = address.removeprefix("s3://").partition("?")
+        self.name, _, path = place.partition("/")
+        if not self.name or "@" in self.name:
+            raise ConfigError("s3://... is no bucket; write s3://bucket/prefix.")
+        settings = parse_qs(query, keep_blank_values=True)
+        if mark and settings.keys() != {"endpoint_url"}:
+            raise ConfigError(
+                "Only ?endpoint_url=https://... may follow the name of a bucket and its folder; a folder with "
+                "a question mark in its name cannot be named."
+            )
+        self.path = path.strip("/")
         try:
             import boto3
             from botocore.config import Config
         except ModuleNotFoundError:
             raise ConfigError("A bucket needs boto3; install it with: pip install boto3") from None
-        self.name, self.path = parts.netloc, parts.path.strip("/")
-        endpoint = parse_qs(parts.query).get("endpoint_url", [None])[0]
+        endpoint = settings["endpoint_url"][0] if mark else None
         with self._translate_errors():
             self._client: S3Client = boto3.client(
                 "s3",
