@@ -1,6 +1,7 @@
 """A scene in a bucket, which the service fetches by addresses that hold for some hours."""
 
 import json
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -80,15 +81,27 @@ def test_fetching_from_a_bucket_goes_on_where_it_was(front: FrontEnd, place: str
     bucket.close()
 
 
-def test_archive_of_a_bucket_is_fetched_and_what_is_not_there_is_told(front: FrontEnd, place: str) -> None:
+def test_archive_of_a_bucket_is_fetched_and_what_is_not_there_is_told(
+    front: FrontEnd, place: str, conninfo: str
+) -> None:
+    archive = place.replace("/fox", "/archive.zip")
     with Api(front.address, front.token) as api:
-        archive = place.replace("/fox", "/archive.zip")
         assert import_bucket(api, archive)["photographs"] == len(photographs())
         with pytest.raises(ConfigError, match="ZIP file"):
             import_bucket(api, place, sha256="0" * 64)
         with pytest.raises(DatasetError, match="holds no files"):
             import_bucket(api, f"{place}/nothing")
+    archive_tasks = tasks(conninfo)
+    time.sleep(1.1)  # its address is signed anew, with another time
+    with Api(front.address, front.token) as api:
+        ids = [import_bucket(api, archive)["id"] for _ in range(2)]
+        assert len(set(ids)) == 1 and tasks(conninfo) == archive_tasks
+        api.request("DELETE", f"/v1/datasets/{ids[0]}")
+        again = import_bucket(api, archive)
+        assert (again["id"] != ids[0], again["photographs"]) == (True, len(photographs()))
+        assert tasks(conninfo) == archive_tasks
     for address, words in (
+        (f"{archive}.zip", "cannot be read (404)"),
         ("s3://no-such-bucket/fox", "cannot be read (NoSuchBucket)"),
         ("s3:///fox", "is no bucket"),
         (f"{place}?endpoint_url=nowhere", "cannot be reached"),

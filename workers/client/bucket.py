@@ -15,8 +15,8 @@ from urllib.parse import parse_qs
 from octasplat.engine.core.errors import ConfigError, DatasetError
 from octasplat.engine.core.scene_layout import is_ignored_file
 from octasplat.workers.client.api import Api, ServiceError
-from octasplat.workers.client.dataset_files import ProgressCounter, create_dataset_once, keep_files
-from octasplat.workers.client.dataset_tasks import commit, import_scene, wait_for_task
+from octasplat.workers.client.dataset_files import ProgressCounter, keep_files
+from octasplat.workers.client.dataset_tasks import commit, create_dataset_once, import_scene, wait_for_task
 from octasplat.workers.client.upload import preview_files
 
 if TYPE_CHECKING:
@@ -61,8 +61,8 @@ class Bucket:
         settings = parse_qs(query, keep_blank_values=True)
         if mark and settings.keys() != {"endpoint_url"}:
             raise ConfigError(
-                "Only ?endpoint_url=https://... may follow the name of a bucket and its folder; a folder with "
-                "a question mark in its name cannot be named."
+                "Only ?endpoint_url=https://... may follow a bucket and its folder; a folder with a question "
+                "mark in its name cannot be named."
             )
         self.path = path.strip("/")
         try:
@@ -82,6 +82,21 @@ class Bucket:
     def close(self) -> None:
         """Close the HTTP connections."""
         self._client.close()
+
+    @property
+    def place(self) -> str:
+        """Return the address without that of the store."""
+        return f"s3://{self.name}/{self.path}"
+
+    def find_file(self, key: str) -> BucketObject:
+        """Return the object of that key.
+
+        Raises:
+            ConfigError: it is not there, or cannot be read.
+        """
+        with self._translate_errors():
+            facts = self._client.head_object(Bucket=self.name, Key=key)
+        return BucketObject(key, facts["ContentLength"], facts["ETag"])
 
     def list_files(self) -> dict[str, BucketObject]:
         """Return the objects below the path by their names there, but for those that are no files.
@@ -159,7 +174,11 @@ def import_bucket(
     try:
         name = PurePosixPath(bucket.path).stem or bucket.name
         if PurePosixPath(bucket.path).suffix.lower() == ".zip":
-            return import_scene(api, bucket.file_address(bucket.path), name=name, sha256=sha256)
+            file = bucket.find_file(bucket.path)
+            # The address of the same file is another one each time that it is signed.
+            version = f"{bucket.place}\n{file.size_bytes}\n{file.etag}"
+            url = bucket.file_address(file.key)
+            return import_scene(api, url, name=name, sha256=sha256, version=version)
         if sha256 is not None:
             raise ConfigError("A digest goes with a ZIP file, not with a folder of a bucket.")
         return _import_folder(api, bucket, name, progress, on_warning)
@@ -174,7 +193,7 @@ def _import_folder(
     progress: Callable[[int, int], None],
     on_warning: Callable[[str], None],
 ) -> dict[str, Any]:
-    place = f"s3://{bucket.name}/{bucket.path}"
+    place = bucket.place
     objects = bucket.list_files()
     if not objects:
         raise DatasetError(f"{place} holds no files; name the folder that holds images/.")

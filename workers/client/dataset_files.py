@@ -4,7 +4,6 @@ import base64
 import hashlib
 import threading
 import urllib.parse
-import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
@@ -16,8 +15,6 @@ from octasplat.workers.client.api import Api, ServiceError
 from octasplat.workers.client.resumable_upload import MIN_RESUMABLE_BYTES, send_resumable
 
 PARALLEL_UPLOADS = 4
-MAX_DELETED_DATASETS = 30
-"""So many datasets of the same files that were deleted are looked past for one that is there."""
 MAX_ASKED_FILES = 500
 """Files that the service is asked for at once; the next ones are read meanwhile."""
 MAX_ASKED_BYTES = 1 << 18
@@ -33,25 +30,6 @@ class LocalFile:
     name: str
     path: Path
     size_bytes: int
-
-
-def create_dataset_once(api: Api, body: Mapping[str, Any], key: str) -> dict[str, Any]:
-    """Return the dataset that was made with a key before, or a new one.
-
-    Raises:
-        ServiceError: the owner has too many datasets.
-        ServiceUnreachableError: the service was away for too long.
-    """
-    for number in range(MAX_DELETED_DATASETS):
-        try:
-            found: dict[str, Any] = api.post("/v1/datasets", body, key=f"{key}-{number}" if number else key)
-        except ServiceError as error:
-            if error.status != 404:  # it was deleted since, and the next one may be there
-                raise
-        else:
-            return found
-    made: dict[str, Any] = api.post("/v1/datasets", body, key=uuid.uuid4().hex)
-    return made
 
 
 def send_files(

@@ -10,13 +10,12 @@ from octasplat.engine.core.scene_layout import is_ignored_file
 from octasplat.workers.client.api import Api
 from octasplat.workers.client.dataset_files import (
     LocalFile,
-    create_dataset_once,
     describe_unsent,
     put_file,
     send_files,
     sha256_of,
 )
-from octasplat.workers.client.dataset_tasks import commit
+from octasplat.workers.client.dataset_tasks import commit, create_dataset_once
 from octasplat.workers.client.resumable_upload import MIN_RESUMABLE_BYTES, send_resumable
 
 _ARCHIVE_END_BYTES = 1 << 18
