@@ -128,3 +128,13 @@ def test_folder_with_odd_characters_in_its_name_is_that_folder(front: FrontEnd, 
     for address in ("s3://[x/fox", "s3://a:b/fox"):
         told = CliRunner().invoke(cli, ["submit", address])
         assert told.exit_code == 1 and "unexpected" not in told.stderr, told.output
+
+
+def test_temporary_credentials_with_long_tokens_do(
+    front: FrontEnd, place: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their token stands in each address, and AWS lets it have 4096 bytes."""
+    monkeypatch.setenv("AWS_SESSION_TOKEN", "A0+/wXyZ" * 512)
+    monkeypatch.setattr(boto3, "DEFAULT_SESSION", None)  # it remembers the credentials
+    with Api(front.address, front.token) as api:
+        assert import_bucket(api, place)["photographs"] == len(photographs())
