@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -11,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from octasplat.engine.core.errors import DatasetError
 from octasplat.workers.client import backoff
 from octasplat.workers.client.api import Api, ServiceError, ServiceUnreachableError
 from octasplat.workers.client.download import download_results
@@ -325,6 +327,56 @@ def test_file_that_was_stored_before_the_answer_to_its_last_part_was_lost(
     with Api(front.address) as api:
         assert upload_files(api, {"a.obj": tmp_path / "a.obj"})["state"] == "committed"
     assert sum(asked.startswith(("PUT", "PATCH")) for asked in front.asked) == (2 if part_bytes else 1)
+
+
+@pytest.mark.parametrize("resumable_bytes", [8, 1 << 20])
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda path: path.write_text("x"), "became shorter while it was sent"),
+        (lambda path: path.write_text("x" * 100), None),
+        (lambda path: path.unlink(), "cannot be read (No such file"),
+    ],
+)
+def test_file_whose_length_changes_while_it_is_sent_is_told(
+    serve: Callable[..., Front],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    change: Callable[[Path], None],
+    words: str | None,
+    resumable_bytes: int,
+) -> None:
+    monkeypatch.setattr("octasplat.workers.client.dataset_files.MIN_RESUMABLE_BYTES", resumable_bytes)
+    service, file, bodies = Datasets(), tmp_path / "a.obj", list[bytes]()
+    file.write_text("y" * 50)
+    open_file = Path.open
+
+    def change_when_sent(path: Path, *arguments: Any, **named: Any) -> Any:
+        opened.append(path)
+        if len(opened) == 2:  # the first time is for the digest
+            change(file)
+        return open_file(path, *arguments, **named)
+
+    def answer(method: str, path: str, headers: dict[str, str], body: bytes) -> Answer:
+        if path.endswith("/t"):
+            return as_json({"id": "t", "dataset_id": "d0", "state": "succeeded", "problem": None})
+        if method == "POST" and path.endswith("/uploads"):
+            made = {"size_bytes": 50, "offset_bytes": 0, "part_bytes": 50, "parts_ahead": []}
+            return 201, {"Location": "/v1/datasets/d0/uploads/u"}, json.dumps(made).encode()
+        if method != "PUT":
+            return service(method, path, headers, body)
+        bodies.append(body)
+        return 204, {"Location": "/v1/datasets/d0/tasks/t"}, b""
+
+    opened: list[Path] = []
+    with Api(serve(answer).address) as api:
+        monkeypatch.setattr(Path, "open", change_when_sent)
+        if words is None:  # the service compares the digest
+            upload_files(api, {"a.obj": file})
+            assert [len(body) for body in bodies] == [50]
+        else:
+            with pytest.raises(DatasetError, match=re.escape(words)):
+                upload_files(api, {"a.obj": file})
 
 
 def test_large_and_small_files_share_four_connections(

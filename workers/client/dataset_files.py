@@ -13,6 +13,7 @@ from typing import Any
 
 from octasplat.workers.client.api import Api, ServiceError
 from octasplat.workers.client.resumable_upload import MIN_RESUMABLE_BYTES, send_resumable
+from octasplat.workers.client.upload_parts import FileRange, file_size, unreadable_error
 
 PARALLEL_UPLOADS = 4
 MAX_ASKED_FILES = 500
@@ -20,7 +21,6 @@ MAX_ASKED_FILES = 500
 MAX_ASKED_BYTES = 1 << 18
 """Length of such a request, about; a service takes a megabyte."""
 _BYTES_BESIDE_NAME = 100
-_PIECE_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,7 @@ def send_files(
         Those files that were not sent, as the dataset, or another one of its owner, has them already.
 
     Raises:
+        DatasetError: one cannot be read, or has become shorter while it was sent.
         ServiceError: the service refuses one; the text names it.
         ServiceUnreachableError: the service was away for too long.
     """
@@ -106,20 +107,34 @@ def keep_files(api: Api, dataset_id: str, names: Set[str]) -> dict[str, str]:
 
 
 def put_file(api: Api, address: str, path: Path, sha256: str) -> Any:
-    """Send a file in one request, with its digest."""
+    """Send a file in one request, with its digest.
+
+    Raises:
+        DatasetError: it cannot be read, or has become shorter.
+        ServiceError: the service refuses it, as one that has changed since its digest was taken.
+        ServiceUnreachableError: the service was away for too long.
+    """
     encoded = base64.b64encode(bytes.fromhex(sha256)).decode()
+    size = file_size(path)
     headers = {
         "Repr-Digest": f"sha-256=:{encoded}:",
         "Content-Type": "application/octet-stream",
-        "Content-Length": str(path.stat().st_size),
+        "Content-Length": str(size),
     }
-    return api.request("PUT", address, content=_RereadableFile(path), headers=headers)
+    return api.request("PUT", address, content=FileRange(path, 0, size), headers=headers)
 
 
 def sha256_of(path: Path) -> str:
-    """Return the digest of a file, in hexadecimal."""
-    with path.open("rb") as handle:
-        return hashlib.file_digest(handle, "sha256").hexdigest()
+    """Return the digest of a file, in hexadecimal.
+
+    Raises:
+        DatasetError: it cannot be read.
+    """
+    try:
+        with path.open("rb") as handle:
+            return hashlib.file_digest(handle, "sha256").hexdigest()
+    except OSError as error:
+        raise unreadable_error(path, error) from None
 
 
 def describe_unsent(unsent: Sequence[LocalFile], count: int) -> str | None:
@@ -177,18 +192,6 @@ def _raise_failure(jobs: Sequence[Future[None]]) -> None:
     for job in jobs:
         if job.done() and not job.cancelled():
             job.result()
-
-
-class _RereadableFile:
-    """A file's content that can be sent again when the first try breaks off."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def __iter__(self) -> Iterator[bytes]:
-        with self._path.open("rb") as handle:
-            while piece := handle.read(_PIECE_BYTES):
-                yield piece
 
 
 class ProgressCounter:

@@ -20,7 +20,7 @@ from octasplat.workers.client.api import (
     ServiceUnreachableError,
 )
 from octasplat.workers.client.dataset_tasks import wait_for_task
-from octasplat.workers.client.upload_parts import PARALLEL_PARTS, FileRange, Upload, send_parts
+from octasplat.workers.client.upload_parts import PARALLEL_PARTS, FileRange, Upload, file_size, send_parts
 
 MIN_RESUMABLE_BYTES = 32 << 20
 """Smaller files are sent in one request, and again from their beginning."""
@@ -53,10 +53,11 @@ def send_resumable(
         connections: taken for each part, as other files may be sent meanwhile; by default of its own.
 
     Raises:
+        DatasetError: it cannot be read, or has become shorter.
         ServiceError: the service refuses it.
         ServiceUnreachableError: the service was away for too long.
     """
-    upload = _find_or_create(api, dataset_id, name, sha256, path.stat().st_size)
+    upload = _find_or_create(api, dataset_id, name, sha256, file_size(path))
     task = None
     try:
         if upload.can_take_parts:
