@@ -413,6 +413,35 @@ def test_large_and_small_files_share_four_connections(
     assert told[-1] == max(told) == 4 * 1 + 4 * 8
 
 
+def test_large_file_is_not_sent_on_when_another_one_is_refused(
+    serve: Callable[..., Front], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor when the program is interrupted; its user would wait for as long as the file takes."""
+    monkeypatch.setattr("octasplat.workers.client.dataset_files.MIN_RESUMABLE_BYTES", 64)
+    service, sent = Datasets(), threading.Event()
+    files = {"a.obj": tmp_path / "a.obj", "b.obj": tmp_path / "b.obj"}
+    for path, length in zip(files.values(), (64, 1), strict=True):
+        path.write_text("x" * length)
+
+    def answer(method: str, path: str, headers: dict[str, str], body: bytes) -> Answer:
+        if method == "POST" and path.endswith("/uploads"):
+            made = {"size_bytes": 64, "offset_bytes": 0, "part_bytes": 1, "parts_ahead": []}
+            return 201, {"Location": "/v1/datasets/d0/uploads/u"}, json.dumps(made).encode()
+        if method != "PUT":
+            return service(method, path, headers, body)
+        if path.endswith("/b.obj"):
+            sent.wait(10)
+            return as_json({"detail": "It is no mesh."}, 422)
+        sent.set()
+        time.sleep(0.05)
+        return 204, {}, b""
+
+    front = serve(answer)
+    with Api(front.address) as api, pytest.raises(ServiceError, match="no mesh"):
+        upload_files(api, files)
+    assert sum("/parts/" in asked for asked in front.asked) < 32
+
+
 def test_commit_after_interrupted_check_succeeds(serve: Callable[..., Front], tmp_path: Path) -> None:
     service = Datasets()
     service.refusals = 3

@@ -6,7 +6,7 @@ import threading
 import urllib.parse
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -56,12 +56,20 @@ def send_files(
     unsent: list[LocalFile] = []
     jobs: list[Future[None]] = []
 
-    connections = threading.Semaphore(PARALLEL_UPLOADS)
+    connections, is_given_up = threading.Semaphore(PARALLEL_UPLOADS), threading.Event()
 
     def send(file: LocalFile, sha256: str) -> None:
         if file.size_bytes >= MIN_RESUMABLE_BYTES:
             with counter.part() as tell:
-                send_resumable(api, dataset_id, file.path, file.name, sha256, tell, connections)
+
+                def tell_unless_given_up(done: int) -> None:
+                    if is_given_up.is_set():
+                        raise _GivenUpError
+                    tell(done)
+
+                send_resumable(
+                    api, dataset_id, file.path, file.name, sha256, tell_unless_given_up, connections
+                )
         else:
             with connections:
                 put_file(api, _file_address(dataset_id, file.name), file.path, sha256)
@@ -82,7 +90,8 @@ def send_files(
                 _raise_failure(jobs)
             wait(jobs, return_when=FIRST_EXCEPTION)
         finally:
-            # What is being sent is sent to its end; what has not begun does not begin.
+            # What has not begun does not begin; of large files, which may take hours, what has come is kept.
+            is_given_up.set()
             sending.shutdown(wait=True, cancel_futures=True)
     _raise_failure(jobs)
     return unsent
@@ -188,10 +197,15 @@ def _batches(files: Sequence[LocalFile]) -> Iterator[list[LocalFile]]:
 
 
 def _raise_failure(jobs: Sequence[Future[None]]) -> None:
-    """Raise what the first of the uploads that failed so far raised."""
+    """Raise what the first of the uploads that failed so far raised; others may have been given up for it."""
     for job in jobs:
         if job.done() and not job.cancelled():
-            job.result()
+            with suppress(_GivenUpError):
+                job.result()
+
+
+class _GivenUpError(Exception):
+    """A file is not sent on, as another one failed or whoever asked for it has gone."""
 
 
 class ProgressCounter:
