@@ -153,6 +153,32 @@ async def test_parts_come_in_any_order_and_at_once(
         assert (await http.post(f"{dataset}/commit")).json()["has_poses"]
 
 
+async def test_front_end_of_the_former_version_writes_over_parts_that_came_ahead(
+    connect_service: ConnectService, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It knows nothing of them, and leaves them there."""
+    monkeypatch.setattr(receive, "PARALLEL_PART_BYTES", 20)
+    digest = hashlib.sha256(PICTURE).hexdigest()
+    async with connect_service() as (http, service):
+        dataset = await new_dataset(http)
+        upload = await new_upload(http, dataset, PICTURE, path="images/a.png", sha256=digest)
+        for start in (0, 40):
+            assert (await send(http, upload, start, PICTURE[start : start + 40])).status_code == 204
+        async with service.pool.connection() as connection:
+            await connection.execute(
+                """
+                INSERT INTO upload_parts (upload_id, start_bytes, owner, sha256, size_bytes)
+                SELECT id, ahead.start, owner, ahead.digest, 20
+                FROM uploads CROSS JOIN unnest(%s::bigint[], %s::text[]) AS ahead (start, digest)
+                """,
+                [[20, 60], [hashlib.sha256(PICTURE[s : s + 20]).hexdigest() for s in (20, 60)]],
+            )
+        last = await send(http, upload, 80, PICTURE[80:])
+        task = await task_over(http, httpx.Response(202, headers={"Location": last.headers["Location"]}))
+        assert task["state"] == "succeeded", task
+        assert (await http.get(f"{dataset}/files/images/a.png")).content == PICTURE
+
+
 async def test_part_that_does_not_fit_is_refused(
     connect_service: ConnectService, monkeypatch: pytest.MonkeyPatch
 ) -> None:
