@@ -21,7 +21,7 @@ import psycopg
 import pytest
 from PIL import Image
 
-from octasplat.service.actions import task_runner, uploads
+from octasplat.service.actions import resumable_uploads, task_runner, uploads
 from octasplat.service.intake import receive
 from octasplat.service.state import Service
 from octasplat.workers.client.api import Api
@@ -29,6 +29,7 @@ from octasplat.workers.client.upload import upload_scene
 from octasplat.workers.client.upload_parts import PARALLEL_PARTS
 from octasplat.workers.db.dataset_tasks import DatasetTask
 from octasplat.workers.db.quotas import Quota, set_quota
+from octasplat.workers.db.uploads import FileUpload, delete_upload
 from octasplat.workers.maintenance.garbage_collection import collect_garbage_now
 from octasplat.workers.maintenance.retention import apply_retention
 from octasplat.workers.settings import Retention
@@ -177,6 +178,25 @@ async def test_front_end_of_the_former_version_writes_over_parts_that_came_ahead
         task = await task_over(http, httpx.Response(202, headers={"Location": last.headers["Location"]}))
         assert task["state"] == "succeeded", task
         assert (await http.get(f"{dataset}/files/images/a.png")).content == PICTURE
+
+
+async def test_upload_that_is_stored_while_it_is_asked_for_is_found(
+    connect_service: ConnectService, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Or the file would be sent again, as that of an upload that is over."""
+    create = resumable_uploads.create_upload
+
+    async def create_and_store(service: Service, *asked: Any, **named: Any) -> FileUpload:
+        upload = await create(service, *asked, **named)
+        async with service.pool.connection() as connection:
+            await delete_upload(connection, upload)
+        return upload
+
+    monkeypatch.setattr(resumable_uploads, "create_upload", create_and_store)
+    async with connect_service() as (http, _):
+        dataset = await new_dataset(http)
+        upload = await new_upload(http, dataset, PICTURE, path="images/a.png")
+        assert (await http.get(upload)).status_code == 404
 
 
 async def test_part_that_does_not_fit_is_refused(
