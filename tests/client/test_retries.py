@@ -16,6 +16,7 @@ from octasplat.engine.core.errors import DatasetError
 from octasplat.workers.client import backoff
 from octasplat.workers.client.api import Api, ServiceError, ServiceUnreachableError
 from octasplat.workers.client.download import download_results
+from octasplat.workers.client.resumable_upload import send_resumable
 from octasplat.workers.client.upload import upload_files
 from octasplat.workers.client.watch import watch_job
 from tests.support.http_server import QuietHandler
@@ -327,6 +328,32 @@ def test_file_that_was_stored_before_the_answer_to_its_last_part_was_lost(
     with Api(front.address) as api:
         assert upload_files(api, {"a.obj": tmp_path / "a.obj"})["state"] == "committed"
     assert sum(asked.startswith(("PUT", "PATCH")) for asked in front.asked) == (2 if part_bytes else 1)
+
+
+@pytest.mark.parametrize("state", ["succeeded", "failed"])
+def test_archive_that_was_stored_after_its_sender_was_killed_is_not_sent_again(
+    serve: Callable[..., Front], tmp_path: Path, state: str
+) -> None:
+    """But one that was refused is, as there may be room for it now."""
+    (tmp_path / "a.zip").write_bytes(b"x")
+
+    def answer(method: str, path: str, headers: dict[str, str], _body: bytes) -> Answer:
+        if path.endswith("/tasks"):
+            kinds = {"commit": "failed", "upload": state}
+            return as_json({"tasks": [{"kind": k, "state": s} for k, s in kinds.items()], "next": None})
+        if path.endswith("/t"):
+            return as_json({"id": "t", "dataset_id": "d", "state": "succeeded", "problem": None})
+        if method == "POST":
+            if headers["Idempotency-Key"].endswith("-0"):
+                return as_json({"detail": "There is no such upload."}, 404)
+            made = {"size_bytes": 1, "offset_bytes": 0, "part_bytes": 1}
+            return 201, {"Location": "/v1/datasets/d/uploads/u"}, json.dumps(made).encode()
+        return 204, {"Location": "/v1/datasets/d/tasks/t"}, b""
+
+    front = serve(answer)
+    with Api(front.address) as api:
+        send_resumable(api, "d", tmp_path / "a.zip", None, hashlib.sha256(b"x").hexdigest())
+    assert sum(asked.startswith("PUT") for asked in front.asked) == (state == "failed")
 
 
 @pytest.mark.parametrize("resumable_bytes", [8, 1 << 20])

@@ -58,6 +58,8 @@ def send_resumable(
         ServiceUnreachableError: the service was away for too long.
     """
     upload = _find_or_create(api, dataset_id, name, sha256, file_size(path))
+    if upload is None:
+        return
     task = None
     try:
         if upload.can_take_parts:
@@ -126,8 +128,8 @@ def _send_in_order(api: Api, upload: Upload, path: Path, progress: Callable[[int
     return str(task)
 
 
-def _find_or_create(api: Api, dataset_id: str, name: str | None, sha256: str, size: int) -> Upload:
-    """Return the upload of this file, a new one unless one is under way."""
+def _find_or_create(api: Api, dataset_id: str, name: str | None, sha256: str, size: int) -> Upload | None:
+    """Return the upload of this file, a new one unless one is under way; None for a ZIP file that is stored."""
     metadata = {"sha256": sha256} if name is None else {"path": name, "sha256": sha256}
     encoded = (f"{key} {base64.b64encode(value.encode()).decode()}" for key, value in metadata.items())
     headers = {**_VERSION, "Upload-Length": str(size), "Upload-Metadata": ",".join(encoded)}
@@ -139,9 +141,18 @@ def _find_or_create(api: Api, dataset_id: str, name: str | None, sha256: str, si
         except ServiceError as error:
             if error.status != _NOT_FOUND:  # it was stored or given up since, and the next one may be there
                 raise
+            if name is None and _was_unpacked(api, dataset_id):
+                return None
         else:
             return Upload.from_answer(str(response.headers["Location"]), response.json())
     raise ServiceError(f"The file was sent {MAX_STORED_BEFORE} times before; make a new dataset.")
+
+
+def _was_unpacked(api: Api, dataset_id: str) -> bool:
+    """Return whether the ZIP file whose upload is over has been stored, as after its sender was killed."""
+    tasks = api.iterate_pages(f"/v1/datasets/{dataset_id}/tasks", "tasks")
+    newest = next((task for task in tasks if task["kind"] == "upload"), None)
+    return newest is not None and newest["state"] == "succeeded"
 
 
 def _offset(api: Api, address: str) -> int:
