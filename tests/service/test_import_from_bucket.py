@@ -1,13 +1,16 @@
 """A scene in a bucket, which the service fetches by addresses that hold for some hours."""
 
+import io
 import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import boto3
 import psycopg
 import pytest
+from botocore.awsrequest import AWSRequest, AWSResponse
 from click.testing import CliRunner
 
 import octasplat as osp
@@ -138,3 +141,45 @@ def test_temporary_credentials_with_long_tokens_do(
     monkeypatch.setattr(boto3, "DEFAULT_SESSION", None)  # it remembers the credentials
     with Api(front.address, front.token) as api:
         assert import_bucket(api, place)["photographs"] == len(photographs())
+
+
+@pytest.mark.parametrize(
+    ("name", "host"),
+    [
+        ("captures", "https://captures.s3.eu-central-1.amazonaws.com/fox/"),
+        ("my.captures", "https://s3.eu-central-1.amazonaws.com/my.captures/fox/"),
+    ],
+)
+def test_addresses_are_signed_for_the_region_of_the_bucket(
+    monkeypatch: pytest.MonkeyPatch, name: str, host: str
+) -> None:
+    """Whichever region the client is set to; a signature for another one is refused."""
+    for variable in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.setenv(variable, "x" * 16)
+    monkeypatch.setenv("AWS_DEFAULT_REGION", "us-east-1")
+    monkeypatch.delenv("AWS_ENDPOINT_URL_S3", raising=False)
+    monkeypatch.setattr(boto3, "DEFAULT_SESSION", None)
+    make = boto3.client
+
+    def answer(request: AWSRequest, **_named: object) -> AWSResponse:
+        headers = {"x-amz-bucket-region": "eu-central-1", "Content-Type": "application/xml"}
+        is_right = "eu-central-1" in str(request.headers["Authorization"])
+        listing = "<ListBucketResult><IsTruncated>false</IsTruncated><Contents><Key>fox/a b.png</Key>"
+        listing += '<Size>1</Size><ETag>"x"</ETag></Contents></ListBucketResult>'
+        wrong = "<Error><Code>AuthorizationHeaderMalformed</Code><Region>eu-central-1</Region></Error>"
+        body = (listing if is_right else wrong) if request.method == "GET" else ""
+        raw = io.BytesIO(body.encode())
+        raw.stream = lambda: iter([body.encode()])  # type: ignore[attr-defined]
+        return AWSResponse(request.url, 200 if is_right else 400, headers, raw)
+
+    def client(*given: Any, **named: Any) -> Any:
+        made = make(*given, **named)
+        made.meta.events.register("before-send.s3", answer)
+        return made
+
+    monkeypatch.setattr(boto3, "client", client)
+    bucket = Bucket(f"s3://{name}/fox")
+    assert list(bucket.list_files()) == ["a b.png"]
+    address = bucket.file_address("fox/a b.png")
+    bucket.close()
+    assert address.startswith(f"{host}a%20b.png?") and "%2Feu-central-1%2Fs3%2F" in address

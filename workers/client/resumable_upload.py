@@ -129,7 +129,7 @@ def _send_in_order(api: Api, upload: Upload, path: Path, progress: Callable[[int
 
 
 def _find_or_create(api: Api, dataset_id: str, name: str | None, sha256: str, size: int) -> Upload | None:
-    """Return the upload of this file, a new one unless one is under way; None for a ZIP file that is stored."""
+    """Return the upload of this file, a new one unless one is under way; None if a ZIP file is stored."""
     metadata = {"sha256": sha256} if name is None else {"path": name, "sha256": sha256}
     encoded = (f"{key} {base64.b64encode(value.encode()).decode()}" for key, value in metadata.items())
     headers = {**_VERSION, "Upload-Length": str(size), "Upload-Metadata": ",".join(encoded)}
