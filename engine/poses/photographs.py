@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from octasplat.engine.core.errors import DatasetError
+from octasplat.engine.core.folder_files import files_below
 from octasplat.engine.core.portable_names import unportable_names_sentence
 from octasplat.engine.core.scene_layout import (
     IMAGES,
@@ -59,7 +60,7 @@ def _layout_of(scene: Path) -> SceneLayout:
 
 def _files_below(folder: Path) -> list[str]:
     """Return files by their paths below ``folder``, sorted, without hidden ones."""
-    found = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+    found = (path.relative_to(folder).as_posix() for path in files_below(folder))
     return sorted(name for name in found if not is_ignored_file(name))
 
 

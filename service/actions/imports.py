@@ -15,7 +15,7 @@ from octasplat.service.actions.uploads import Upload
 from octasplat.service.auth import Principal
 from octasplat.service.idempotency import create_once, fingerprint
 from octasplat.service.problems import ProblemError, not_found_error
-from octasplat.service.schemas.datasets import NewImport
+from octasplat.service.schemas.datasets import MAX_IMPORT_URL, NewImport
 from octasplat.service.state import Service
 from octasplat.workers.db.connections import retry_on_deadlock
 from octasplat.workers.db.dataset_tasks import DatasetTask, get_task
@@ -47,7 +47,7 @@ async def request_import(
     """
     check_not_draining(service)
     try:
-        check_url(new.url, service.settings.import_hosts)
+        check_url(new.url, service.settings.import_hosts, max_length=MAX_IMPORT_URL)
     except AddressRefusedError as error:
         raise _import_error(str(error), "import-address") from None
     async with service.pool.connection() as connection, connection.transaction():
@@ -98,7 +98,7 @@ async def _opened(service: Service, principal: Principal, url: str) -> AsyncIter
             try:
                 request = client.build_request(
                     "GET",
-                    check_url(url, allowed),
+                    check_url(url, allowed, max_length=MAX_IMPORT_URL),
                     headers={"Accept-Encoding": "identity"},
                     extensions={OWNER_EXTENSION: principal.owner},
                 )

@@ -5,7 +5,7 @@ They are kept beside those that come in order, see :mod:`octasplat.service.actio
 
 import uuid
 
-from octasplat.service.actions.access import check_not_draining, fetch_visible_dataset, open_dataset
+from octasplat.service.actions.access import check_not_draining, open_dataset
 from octasplat.service.actions.resumable_uploads import store_if_whole, upload_in
 from octasplat.service.actions.uploads import Upload
 from octasplat.service.auth import Principal
@@ -20,17 +20,9 @@ from octasplat.workers.db.uploads import FileUpload, UploadPart
 from octasplat.workers.queue.storage_leases import StorageLease
 
 
-async def parts_ahead(
-    service: Service, principal: Principal, dataset_id: uuid.UUID, upload_id: uuid.UUID
-) -> list[int]:
-    """Return where parts of an upload begin that have come, though not all before them has.
-
-    Raises:
-        ProblemError: 404 if it does not exist or the principal may not see it.
-    """
+async def parts_ahead(service: Service, upload: FileUpload) -> list[int]:
+    """Return where parts of an upload begin that have come behind its offset; none once it is stored."""
     async with service.pool.connection() as connection:
-        await fetch_visible_dataset(connection, principal, dataset_id)
-        upload = await upload_in(connection, dataset_id, upload_id)
         return [start for start, _ in await rows.parts_ahead(connection, upload)]
 
 

@@ -77,7 +77,7 @@ async def create_upload(
     upload = await actions.create_upload(service, principal, dataset_id, new, idempotency_key=key)
     response.headers.update(_headers(upload))
     response.headers["Location"] = f"/v1/datasets/{dataset_id}/uploads/{upload.id}"
-    return UploadView.from_row(upload, await parts_ahead(service, principal, dataset_id, upload.id))
+    return UploadView.from_row(upload, await parts_ahead(service, upload))
 
 
 @router.get(
@@ -97,7 +97,7 @@ async def get_upload(
     response.headers.update(_headers(upload))
     # tus asks for this, as an offset that a cache remembers is out of date.
     response.headers["Cache-Control"] = "no-store"
-    return UploadView.from_row(upload, await parts_ahead(service, principal, dataset_id, upload_id))
+    return UploadView.from_row(upload, await parts_ahead(service, upload))
 
 
 @router.patch(

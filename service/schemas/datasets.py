@@ -8,8 +8,9 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from octasplat.service.schemas.base import EXAMPLE_ID, EXAMPLE_TIME, RequestBody
 from octasplat.workers.db.rows import Dataset, DatasetFile, DatasetHolds, DatasetState
-from octasplat.workers.maintenance.webhooks.addresses import MAX_URL
 
+MAX_IMPORT_URL = 10_000
+"""Characters; signed addresses of a bucket hold the whole of a temporary credential, up to 4 kB."""
 MAX_REUSED_FILES = 1000
 """Files that are asked for in one request."""
 
@@ -36,7 +37,7 @@ class NewImport(RequestBody):
 
     url: str = Field(
         min_length=1,
-        max_length=MAX_URL,
+        max_length=MAX_IMPORT_URL,
         description="https, port 443 or 8443, reachable from everywhere; so must redirects be.",
     )
     path: str | None = Field(

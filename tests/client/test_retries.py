@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -11,9 +12,11 @@ from typing import Any
 
 import pytest
 
+from octasplat.engine.core.errors import DatasetError
 from octasplat.workers.client import backoff
 from octasplat.workers.client.api import Api, ServiceError, ServiceUnreachableError
 from octasplat.workers.client.download import download_results
+from octasplat.workers.client.resumable_upload import send_resumable
 from octasplat.workers.client.upload import upload_files
 from octasplat.workers.client.watch import watch_job
 from tests.support.http_server import QuietHandler
@@ -327,6 +330,82 @@ def test_file_that_was_stored_before_the_answer_to_its_last_part_was_lost(
     assert sum(asked.startswith(("PUT", "PATCH")) for asked in front.asked) == (2 if part_bytes else 1)
 
 
+@pytest.mark.parametrize("state", ["succeeded", "failed"])
+def test_archive_that_was_stored_after_its_sender_was_killed_is_not_sent_again(
+    serve: Callable[..., Front], tmp_path: Path, state: str
+) -> None:
+    """But one that was refused is, as there may be room for it now."""
+    (tmp_path / "a.zip").write_bytes(b"x")
+
+    def answer(method: str, path: str, headers: dict[str, str], _body: bytes) -> Answer:
+        if path.endswith("/tasks"):
+            kinds = {"commit": "failed", "upload": state}
+            return as_json({"tasks": [{"kind": k, "state": s} for k, s in kinds.items()], "next": None})
+        if path.endswith("/t"):
+            return as_json({"id": "t", "dataset_id": "d", "state": "succeeded", "problem": None})
+        if method == "POST":
+            if headers["Idempotency-Key"].endswith("-0"):
+                return as_json({"detail": "There is no such upload."}, 404)
+            made = {"size_bytes": 1, "offset_bytes": 0, "part_bytes": 1}
+            return 201, {"Location": "/v1/datasets/d/uploads/u"}, json.dumps(made).encode()
+        return 204, {"Location": "/v1/datasets/d/tasks/t"}, b""
+
+    front = serve(answer)
+    with Api(front.address) as api:
+        send_resumable(api, "d", tmp_path / "a.zip", None, hashlib.sha256(b"x").hexdigest())
+    assert sum(asked.startswith("PUT") for asked in front.asked) == (state == "failed")
+
+
+@pytest.mark.parametrize("resumable_bytes", [8, 1 << 20])
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda path: path.write_text("x"), "became shorter while it was sent"),
+        (lambda path: path.write_text("x" * 100), None),
+        (lambda path: path.unlink(), "cannot be read (No such file"),
+    ],
+)
+def test_file_whose_length_changes_while_it_is_sent_is_told(
+    serve: Callable[..., Front],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    change: Callable[[Path], None],
+    words: str | None,
+    resumable_bytes: int,
+) -> None:
+    monkeypatch.setattr("octasplat.workers.client.dataset_files.MIN_RESUMABLE_BYTES", resumable_bytes)
+    service, file, bodies = Datasets(), tmp_path / "a.obj", list[bytes]()
+    file.write_text("y" * 50)
+    open_file = Path.open
+
+    def change_when_sent(path: Path, *arguments: Any, **named: Any) -> Any:
+        opened.append(path)
+        if len(opened) == 2:  # the first time is for the digest
+            change(file)
+        return open_file(path, *arguments, **named)
+
+    def answer(method: str, path: str, headers: dict[str, str], body: bytes) -> Answer:
+        if path.endswith("/t"):
+            return as_json({"id": "t", "dataset_id": "d0", "state": "succeeded", "problem": None})
+        if method == "POST" and path.endswith("/uploads"):
+            made = {"size_bytes": 50, "offset_bytes": 0, "part_bytes": 50, "parts_ahead": []}
+            return 201, {"Location": "/v1/datasets/d0/uploads/u"}, json.dumps(made).encode()
+        if method != "PUT":
+            return service(method, path, headers, body)
+        bodies.append(body)
+        return 204, {"Location": "/v1/datasets/d0/tasks/t"}, b""
+
+    opened: list[Path] = []
+    with Api(serve(answer).address) as api:
+        monkeypatch.setattr(Path, "open", change_when_sent)
+        if words is None:  # the service compares the digest
+            upload_files(api, {"a.obj": file})
+            assert [len(body) for body in bodies] == [50]
+        else:
+            with pytest.raises(DatasetError, match=re.escape(words)):
+                upload_files(api, {"a.obj": file})
+
+
 def test_large_and_small_files_share_four_connections(
     serve: Callable[..., Front], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -359,6 +438,35 @@ def test_large_and_small_files_share_four_connections(
     assert 1 < most[0] <= 4
     assert sum(asked.startswith("PUT") for asked in front.asked) == 4 + 4 * 7
     assert told[-1] == max(told) == 4 * 1 + 4 * 8
+
+
+def test_large_file_is_not_sent_on_when_another_one_is_refused(
+    serve: Callable[..., Front], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor when the program is interrupted; its user would wait for as long as the file takes."""
+    monkeypatch.setattr("octasplat.workers.client.dataset_files.MIN_RESUMABLE_BYTES", 64)
+    service, sent = Datasets(), threading.Event()
+    files = {"a.obj": tmp_path / "a.obj", "b.obj": tmp_path / "b.obj"}
+    for path, length in zip(files.values(), (64, 1), strict=True):
+        path.write_text("x" * length)
+
+    def answer(method: str, path: str, headers: dict[str, str], body: bytes) -> Answer:
+        if method == "POST" and path.endswith("/uploads"):
+            made = {"size_bytes": 64, "offset_bytes": 0, "part_bytes": 1, "parts_ahead": []}
+            return 201, {"Location": "/v1/datasets/d0/uploads/u"}, json.dumps(made).encode()
+        if method != "PUT":
+            return service(method, path, headers, body)
+        if path.endswith("/b.obj"):
+            sent.wait(10)
+            return as_json({"detail": "It is no mesh."}, 422)
+        sent.set()
+        time.sleep(0.05)
+        return 204, {}, b""
+
+    front = serve(answer)
+    with Api(front.address) as api, pytest.raises(ServiceError, match="no mesh"):
+        upload_files(api, files)
+    assert sum("/parts/" in asked for asked in front.asked) < 32
 
 
 def test_commit_after_interrupted_check_succeeds(serve: Callable[..., Front], tmp_path: Path) -> None:

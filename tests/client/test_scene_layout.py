@@ -4,8 +4,9 @@ import functools
 import io
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -35,6 +36,8 @@ from octasplat.service.intake.scene_preview import (
     preview_archive,
     preview_files,
 )
+from octasplat.workers.client.api import Api
+from octasplat.workers.client.upload import list_scene_files
 from tests.support.zip_builder import ZipMember, build_zip
 
 PHOTOGRAPHS = ("a.jpg", "b.JPG", "c.webp")
@@ -142,6 +145,29 @@ def test_folder_archive_and_search_take_the_same_photographs(kind: str, tmp_path
     assert told == by_archive(paths) == by_run(tmp_path)
     names = {file.name for file in preview_files([ListedFile(path, 1) for path in paths], LIMITS).files}
     assert {name for name in names if name.startswith("images/")} == {f"images/{name}" for name in expected}
+
+
+def test_folders_behind_links_belong_to_the_scene(tmp_path: Path) -> None:
+    """As a reconstruction here reads them; a link to a folder around it leads nowhere."""
+    write_files(tmp_path / "card", PHOTOGRAPHS)
+    scene = tmp_path / "scene"
+    (scene / "notes").mkdir(parents=True)
+    (scene / "images").symlink_to(tmp_path / "card")
+    (scene / "notes" / "up").symlink_to(scene)
+    (scene / "notes" / "lost").symlink_to(tmp_path / "nothing")
+    assert by_run(scene).photographs == {f"images/{name}" for name in PHOTOGRAPHS}
+
+    class Service:
+        def post(self, _address: str, body: dict[str, Any]) -> dict[str, Any]:
+            listed = [ListedFile(file["path"], file["size_bytes"]) for file in body["files"]]
+            preview = preview_files(listed, LIMITS)
+            assert not preview.faults
+            return {"files": [asdict(file) for file in preview.files], "notes": [], "refusals": []}
+
+    sent = list_scene_files(cast(Api, Service()), scene)
+    assert {file.name: file.path for file in sent} == {
+        f"images/{name}": scene / "images" / name for name in PHOTOGRAPHS
+    }
 
 
 PICTURES = st.sampled_from(

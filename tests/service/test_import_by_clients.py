@@ -71,5 +71,8 @@ def test_scene_at_an_address_is_fetched_checked_and_queued(
             ids = {client.import_scene(url, sha256=digest) for _ in range(2)}
             assert len(ids) == 1 and Elsewhere.asked == ["/fox.zip?key=1"]
             assert client.import_scene(url, sha256=None) not in ids
+            with Api(front.address, front.token) as api:
+                api.request("DELETE", f"/v1/datasets/{ids.pop()}")
+            assert client.import_scene(url, sha256=digest) == client.import_scene(url, sha256=digest)
             with pytest.raises(ServiceError, match="SHA-256"):
                 client.import_scene(url, sha256="0" * 64)

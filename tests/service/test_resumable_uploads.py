@@ -21,7 +21,7 @@ import psycopg
 import pytest
 from PIL import Image
 
-from octasplat.service.actions import task_runner, uploads
+from octasplat.service.actions import resumable_uploads, task_runner, uploads
 from octasplat.service.intake import receive
 from octasplat.service.state import Service
 from octasplat.workers.client.api import Api
@@ -29,6 +29,7 @@ from octasplat.workers.client.upload import upload_scene
 from octasplat.workers.client.upload_parts import PARALLEL_PARTS
 from octasplat.workers.db.dataset_tasks import DatasetTask
 from octasplat.workers.db.quotas import Quota, set_quota
+from octasplat.workers.db.uploads import FileUpload, delete_upload
 from octasplat.workers.maintenance.garbage_collection import collect_garbage_now
 from octasplat.workers.maintenance.retention import apply_retention
 from octasplat.workers.settings import Retention
@@ -151,6 +152,51 @@ async def test_parts_come_in_any_order_and_at_once(
         answer = httpx.Response(202, headers={"Location": whole.headers["Location"]})
         assert (await task_over(http, answer))["state"] == "succeeded"
         assert (await http.post(f"{dataset}/commit")).json()["has_poses"]
+
+
+async def test_front_end_of_the_former_version_writes_over_parts_that_came_ahead(
+    connect_service: ConnectService, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It knows nothing of them, and leaves them there."""
+    monkeypatch.setattr(receive, "PARALLEL_PART_BYTES", 20)
+    digest = hashlib.sha256(PICTURE).hexdigest()
+    async with connect_service() as (http, service):
+        dataset = await new_dataset(http)
+        upload = await new_upload(http, dataset, PICTURE, path="images/a.png", sha256=digest)
+        for start in (0, 40):
+            assert (await send(http, upload, start, PICTURE[start : start + 40])).status_code == 204
+        async with service.pool.connection() as connection:
+            await connection.execute(
+                """
+                INSERT INTO upload_parts (upload_id, start_bytes, owner, sha256, size_bytes)
+                SELECT id, ahead.start, owner, ahead.digest, 20
+                FROM uploads CROSS JOIN unnest(%s::bigint[], %s::text[]) AS ahead (start, digest)
+                """,
+                [[20, 60], [hashlib.sha256(PICTURE[s : s + 20]).hexdigest() for s in (20, 60)]],
+            )
+        last = await send(http, upload, 80, PICTURE[80:])
+        task = await task_over(http, httpx.Response(202, headers={"Location": last.headers["Location"]}))
+        assert task["state"] == "succeeded", task
+        assert (await http.get(f"{dataset}/files/images/a.png")).content == PICTURE
+
+
+async def test_upload_that_is_stored_while_it_is_asked_for_is_found(
+    connect_service: ConnectService, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Or the file would be sent again, as that of an upload that is over."""
+    create = resumable_uploads.create_upload
+
+    async def create_and_store(service: Service, *asked: Any, **named: Any) -> FileUpload:
+        upload = await create(service, *asked, **named)
+        async with service.pool.connection() as connection:
+            await delete_upload(connection, upload)
+        return upload
+
+    monkeypatch.setattr(resumable_uploads, "create_upload", create_and_store)
+    async with connect_service() as (http, _):
+        dataset = await new_dataset(http)
+        upload = await new_upload(http, dataset, PICTURE, path="images/a.png")
+        assert (await http.get(upload)).status_code == 404
 
 
 async def test_part_that_does_not_fit_is_refused(

@@ -9,14 +9,14 @@ from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import PurePosixPath
-from typing import TYPE_CHECKING, Any
-from urllib.parse import parse_qs, urlsplit
+from typing import TYPE_CHECKING, Any, Literal
+from urllib.parse import parse_qs
 
 from octasplat.engine.core.errors import ConfigError, DatasetError
 from octasplat.engine.core.scene_layout import is_ignored_file
 from octasplat.workers.client.api import Api, ServiceError
-from octasplat.workers.client.dataset_files import ProgressCounter, create_dataset_once, keep_files
-from octasplat.workers.client.dataset_tasks import commit, import_scene, wait_for_task
+from octasplat.workers.client.dataset_files import ProgressCounter, keep_files
+from octasplat.workers.client.dataset_tasks import commit, create_dataset_once, import_scene, wait_for_task
 from octasplat.workers.client.upload import preview_files
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 ADDRESS_SECONDS = 6 * 3600
 """For so long the service may fetch a file; it begins as soon as it has a place."""
+AddressingStyle = Literal["auto", "virtual", "path"]
 PARALLEL_IMPORTS = 8
 """A service fetches four at once for an owner, and lets sixteen wait."""
 
@@ -53,27 +54,84 @@ class Bucket:
     """
 
     def __init__(self, address: str) -> None:
-        parts = urlsplit(address)
-        if not parts.netloc or parts.username:
-            raise ConfigError(f"{parts.scheme}://... is no bucket; write s3://bucket/prefix.")
+        # Names of objects may hold what ends the path of a web address, as in scan#2.
+        place, mark, query = address.removeprefix("s3://").partition("?")
+        self.name, _, path = place.partition("/")
+        if not self.name or "@" in self.name:
+            raise ConfigError("s3://... is no bucket; write s3://bucket/prefix.")
+        settings = parse_qs(query, keep_blank_values=True)
+        if mark and settings.keys() != {"endpoint_url"}:
+            raise ConfigError(
+                "Only ?endpoint_url=https://... may follow a bucket and its folder; a folder with a question "
+                "mark in its name cannot be named."
+            )
+        self.path = path.strip("/")
         try:
-            import boto3
-            from botocore.config import Config
+            import boto3  # noqa: F401 - here, as many have no bucket
         except ModuleNotFoundError:
             raise ConfigError("A bucket needs boto3; install it with: pip install boto3") from None
-        self.name, self.path = parts.netloc, parts.path.strip("/")
-        endpoint = parse_qs(parts.query).get("endpoint_url", [None])[0]
+        endpoint = settings["endpoint_url"][0] if mark else None
+        self._client = self._open_client(endpoint_url=endpoint)
+        self._signer = self._client
+
+    def _open_client(
+        self, *, endpoint_url: str | None = None, region: str | None = None, style: AddressingStyle = "auto"
+    ) -> "S3Client":
+        import boto3
+        from botocore.config import Config
+
         with self._translate_errors():
-            self._client: S3Client = boto3.client(
+            return boto3.client(
                 "s3",
-                endpoint_url=endpoint,
-                # Other signatures are refused by buckets of newer regions.
-                config=Config(signature_version="s3v4", retries={"max_attempts": 5, "mode": "standard"}),
+                endpoint_url=endpoint_url,
+                region_name=region,
+                config=Config(
+                    # Other signatures are refused by buckets of newer regions.
+                    signature_version="s3v4",
+                    s3={"addressing_style": style},
+                    retries={"max_attempts": 5, "mode": "standard"},
+                ),
             )
+
+    def _sign_for_region(self) -> None:
+        """Sign addresses for the region of the bucket, if Amazon holds it; others are refused.
+
+        Requests of boto3 itself are sent again where they have to go, but not what others do with an address.
+        """
+        from botocore.exceptions import ClientError
+
+        if ".amazonaws.com" not in self._client.meta.endpoint_url:
+            return
+        with self._translate_errors():
+            try:
+                headers = self._client.head_bucket(Bucket=self.name)["ResponseMetadata"]["HTTPHeaders"]
+            except ClientError as error:  # it tells this also for want of a right
+                headers = error.response["ResponseMetadata"]["HTTPHeaders"]
+        region = headers.get("x-amz-bucket-region")
+        # By its own name, which leads to the region at once; certificates do not cover names with dots.
+        style: AddressingStyle = "path" if "." in self.name else "virtual"
+        self._signer = self._open_client(region=region or self._client.meta.region_name, style=style)
 
     def close(self) -> None:
         """Close the HTTP connections."""
         self._client.close()
+        self._signer.close()
+
+    @property
+    def place(self) -> str:
+        """Return the address without that of the store."""
+        return f"s3://{self.name}/{self.path}"
+
+    def find_file(self, key: str) -> BucketObject:
+        """Return the object of that key.
+
+        Raises:
+            ConfigError: it is not there, or cannot be read.
+        """
+        with self._translate_errors():
+            facts = self._client.head_object(Bucket=self.name, Key=key)
+        self._sign_for_region()
+        return BucketObject(key, facts["ContentLength"], facts["ETag"])
 
     def list_files(self) -> dict[str, BucketObject]:
         """Return the objects below the path by their names there, but for those that are no files.
@@ -91,16 +149,17 @@ class Bucket:
                     path = item["Key"].removeprefix(prefix)
                     if path and not path.endswith("/") and not is_ignored_file(path):
                         found[path] = BucketObject(item["Key"], item["Size"], item["ETag"])
+        self._sign_for_region()
         return found
 
     def file_address(self, key: str) -> str:
-        """Return an https address of an object, which holds for some hours.
+        """Return an https address of an object that was found, which holds for some hours.
 
         Raises:
             ConfigError: there are no credentials.
         """
         with self._translate_errors():
-            return self._client.generate_presigned_url(
+            return self._signer.generate_presigned_url(
                 "get_object", Params={"Bucket": self.name, "Key": key}, ExpiresIn=ADDRESS_SECONDS
             )
 
@@ -151,7 +210,11 @@ def import_bucket(
     try:
         name = PurePosixPath(bucket.path).stem or bucket.name
         if PurePosixPath(bucket.path).suffix.lower() == ".zip":
-            return import_scene(api, bucket.file_address(bucket.path), name=name, sha256=sha256)
+            file = bucket.find_file(bucket.path)
+            # The address of the same file is another one each time that it is signed.
+            version = f"{bucket.place}\n{file.size_bytes}\n{file.etag}"
+            url = bucket.file_address(file.key)
+            return import_scene(api, url, name=name, sha256=sha256, version=version)
         if sha256 is not None:
             raise ConfigError("A digest goes with a ZIP file, not with a folder of a bucket.")
         return _import_folder(api, bucket, name, progress, on_warning)
@@ -166,7 +229,7 @@ def _import_folder(
     progress: Callable[[int, int], None],
     on_warning: Callable[[str], None],
 ) -> dict[str, Any]:
-    place = f"s3://{bucket.name}/{bucket.path}"
+    place = bucket.place
     objects = bucket.list_files()
     if not objects:
         raise DatasetError(f"{place} holds no files; name the folder that holds images/.")

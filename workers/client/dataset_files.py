@@ -4,26 +4,23 @@ import base64
 import hashlib
 import threading
 import urllib.parse
-import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from octasplat.workers.client.api import Api, ServiceError
 from octasplat.workers.client.resumable_upload import MIN_RESUMABLE_BYTES, send_resumable
+from octasplat.workers.client.upload_parts import FileRange, file_size, unreadable_error
 
 PARALLEL_UPLOADS = 4
-MAX_DELETED_DATASETS = 30
-"""So many datasets of the same files that were deleted are looked past for one that is there."""
 MAX_ASKED_FILES = 500
 """Files that the service is asked for at once; the next ones are read meanwhile."""
 MAX_ASKED_BYTES = 1 << 18
 """Length of such a request, about; a service takes a megabyte."""
 _BYTES_BESIDE_NAME = 100
-_PIECE_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -33,25 +30,6 @@ class LocalFile:
     name: str
     path: Path
     size_bytes: int
-
-
-def create_dataset_once(api: Api, body: Mapping[str, Any], key: str) -> dict[str, Any]:
-    """Return the dataset that was made with a key before, or a new one.
-
-    Raises:
-        ServiceError: the owner has too many datasets.
-        ServiceUnreachableError: the service was away for too long.
-    """
-    for number in range(MAX_DELETED_DATASETS):
-        try:
-            found: dict[str, Any] = api.post("/v1/datasets", body, key=f"{key}-{number}" if number else key)
-        except ServiceError as error:
-            if error.status != 404:  # it was deleted since, and the next one may be there
-                raise
-        else:
-            return found
-    made: dict[str, Any] = api.post("/v1/datasets", body, key=uuid.uuid4().hex)
-    return made
 
 
 def send_files(
@@ -69,6 +47,7 @@ def send_files(
         Those files that were not sent, as the dataset, or another one of its owner, has them already.
 
     Raises:
+        DatasetError: one cannot be read, or has become shorter while it was sent.
         ServiceError: the service refuses one; the text names it.
         ServiceUnreachableError: the service was away for too long.
     """
@@ -77,12 +56,20 @@ def send_files(
     unsent: list[LocalFile] = []
     jobs: list[Future[None]] = []
 
-    connections = threading.Semaphore(PARALLEL_UPLOADS)
+    connections, is_given_up = threading.Semaphore(PARALLEL_UPLOADS), threading.Event()
 
     def send(file: LocalFile, sha256: str) -> None:
         if file.size_bytes >= MIN_RESUMABLE_BYTES:
             with counter.part() as tell:
-                send_resumable(api, dataset_id, file.path, file.name, sha256, tell, connections)
+
+                def tell_unless_given_up(done: int) -> None:
+                    if is_given_up.is_set():
+                        raise _GivenUpError
+                    tell(done)
+
+                send_resumable(
+                    api, dataset_id, file.path, file.name, sha256, tell_unless_given_up, connections
+                )
         else:
             with connections:
                 put_file(api, _file_address(dataset_id, file.name), file.path, sha256)
@@ -103,7 +90,8 @@ def send_files(
                 _raise_failure(jobs)
             wait(jobs, return_when=FIRST_EXCEPTION)
         finally:
-            # What is being sent is sent to its end; what has not begun does not begin.
+            # What has not begun does not begin; of large files, which may take hours, what has come is kept.
+            is_given_up.set()
             sending.shutdown(wait=True, cancel_futures=True)
     _raise_failure(jobs)
     return unsent
@@ -128,20 +116,34 @@ def keep_files(api: Api, dataset_id: str, names: Set[str]) -> dict[str, str]:
 
 
 def put_file(api: Api, address: str, path: Path, sha256: str) -> Any:
-    """Send a file in one request, with its digest."""
+    """Send a file in one request, with its digest.
+
+    Raises:
+        DatasetError: it cannot be read, or has become shorter.
+        ServiceError: the service refuses it, as one that has changed since its digest was taken.
+        ServiceUnreachableError: the service was away for too long.
+    """
     encoded = base64.b64encode(bytes.fromhex(sha256)).decode()
+    size = file_size(path)
     headers = {
         "Repr-Digest": f"sha-256=:{encoded}:",
         "Content-Type": "application/octet-stream",
-        "Content-Length": str(path.stat().st_size),
+        "Content-Length": str(size),
     }
-    return api.request("PUT", address, content=_RereadableFile(path), headers=headers)
+    return api.request("PUT", address, content=FileRange(path, 0, size), headers=headers)
 
 
 def sha256_of(path: Path) -> str:
-    """Return the digest of a file, in hexadecimal."""
-    with path.open("rb") as handle:
-        return hashlib.file_digest(handle, "sha256").hexdigest()
+    """Return the digest of a file, in hexadecimal.
+
+    Raises:
+        DatasetError: it cannot be read.
+    """
+    try:
+        with path.open("rb") as handle:
+            return hashlib.file_digest(handle, "sha256").hexdigest()
+    except OSError as error:
+        raise unreadable_error(path, error) from None
 
 
 def describe_unsent(unsent: Sequence[LocalFile], count: int) -> str | None:
@@ -195,22 +197,15 @@ def _batches(files: Sequence[LocalFile]) -> Iterator[list[LocalFile]]:
 
 
 def _raise_failure(jobs: Sequence[Future[None]]) -> None:
-    """Raise what the first of the uploads that failed so far raised."""
+    """Raise what the first of the uploads that failed so far raised; others may have been given up for it."""
     for job in jobs:
         if job.done() and not job.cancelled():
-            job.result()
+            with suppress(_GivenUpError):
+                job.result()
 
 
-class _RereadableFile:
-    """A file's content that can be sent again when the first try breaks off."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def __iter__(self) -> Iterator[bytes]:
-        with self._path.open("rb") as handle:
-            while piece := handle.read(_PIECE_BYTES):
-                yield piece
+class _GivenUpError(Exception):
+    """A file is not sent on, as another one failed or whoever asked for it has gone."""
 
 
 class ProgressCounter:

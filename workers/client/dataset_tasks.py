@@ -1,8 +1,9 @@
-"""Tasks of the service on datasets, waited for: commits, and scenes that it fetches from an address."""
+"""Datasets that are made once, and tasks on them that are waited for, such as commits and imports."""
 
 import hashlib
 import time
 import uuid
+from collections.abc import Mapping
 from pathlib import PurePosixPath
 from typing import Any
 from urllib.parse import urlsplit
@@ -14,7 +15,28 @@ from octasplat.workers.client.backoff import Backoff
 
 MAX_CHECK_WAIT_SECONDS = 600.0
 """For so long a check of a dataset that a front end of the former version has begun is waited for."""
+MAX_DELETED_DATASETS = 30
+"""So many datasets of the same files that were deleted are looked past for one that is there."""
 _FIRST_PAUSE_SECONDS, _LAST_PAUSE_SECONDS = 0.2, 3.0
+
+
+def create_dataset_once(api: Api, body: Mapping[str, Any], key: str) -> dict[str, Any]:
+    """Return the dataset that was made with a key before, or a new one.
+
+    Raises:
+        ServiceError: the owner has too many datasets.
+        ServiceUnreachableError: the service was away for too long.
+    """
+    for number in range(MAX_DELETED_DATASETS):
+        try:
+            found: dict[str, Any] = api.post("/v1/datasets", body, key=f"{key}-{number}" if number else key)
+        except ServiceError as error:
+            if error.status != 404:  # it was deleted since, and the next one may be there
+                raise
+        else:
+            return found
+    made: dict[str, Any] = api.post("/v1/datasets", body, key=uuid.uuid4().hex)
+    return made
 
 
 def wait_for_task(api: Api, task: dict[str, Any]) -> dict[str, Any]:
@@ -65,7 +87,9 @@ def is_web_address(scene: object) -> bool:
     return isinstance(scene, str) and scene.startswith(("https://", "http://"))
 
 
-def import_scene(api: Api, url: str, *, name: str | None = None, sha256: str | None = None) -> dict[str, Any]:
+def import_scene(
+    api: Api, url: str, *, name: str | None = None, sha256: str | None = None, version: str | None = None
+) -> dict[str, Any]:
     """Let the service fetch a scene, a ZIP file, and commit it.
 
     Args:
@@ -73,6 +97,7 @@ def import_scene(api: Api, url: str, *, name: str | None = None, sha256: str | N
         url: where the ZIP file is; https, and reachable from everywhere.
         name: what to call the dataset; by default as the file.
         sha256: what the ZIP file must be; then the same call again makes no second dataset.
+        version: what names the ZIP file and its content where the address does not; then as with a digest.
 
     Returns:
         The dataset.
@@ -81,12 +106,14 @@ def import_scene(api: Api, url: str, *, name: str | None = None, sha256: str | N
         ServiceError: the address does not answer well, or the scene is refused.
     """
     name = name or PurePosixPath(urlsplit(url).path).stem
+    if version is None and sha256 is not None:
+        version = url
     key = (
         uuid.uuid4().hex
-        if sha256 is None
-        else hashlib.sha256(f"{url}\n{sha256}\n{name}".encode()).hexdigest()
+        if version is None
+        else hashlib.sha256(f"{version}\n{sha256}\n{name}".encode()).hexdigest()
     )
-    dataset: dict[str, Any] = api.post("/v1/datasets", {"name": name[:200]}, key=f"import-{key}")
+    dataset = create_dataset_once(api, {"name": name[:200]}, f"import-{key}")
     if dataset["state"] == "open":
         task = api.post(f"/v1/datasets/{dataset['id']}/import", {"url": url, "sha256": sha256})
         wait_for_task(api, task)

@@ -20,7 +20,7 @@ from octasplat.workers.client.api import (
     ServiceUnreachableError,
 )
 from octasplat.workers.client.dataset_tasks import wait_for_task
-from octasplat.workers.client.upload_parts import PARALLEL_PARTS, FileRange, Upload, send_parts
+from octasplat.workers.client.upload_parts import PARALLEL_PARTS, FileRange, Upload, file_size, send_parts
 
 MIN_RESUMABLE_BYTES = 32 << 20
 """Smaller files are sent in one request, and again from their beginning."""
@@ -53,10 +53,13 @@ def send_resumable(
         connections: taken for each part, as other files may be sent meanwhile; by default of its own.
 
     Raises:
+        DatasetError: it cannot be read, or has become shorter.
         ServiceError: the service refuses it.
         ServiceUnreachableError: the service was away for too long.
     """
-    upload = _find_or_create(api, dataset_id, name, sha256, path.stat().st_size)
+    upload = _find_or_create(api, dataset_id, name, sha256, file_size(path))
+    if upload is None:
+        return
     task = None
     try:
         if upload.can_take_parts:
@@ -125,8 +128,8 @@ def _send_in_order(api: Api, upload: Upload, path: Path, progress: Callable[[int
     return str(task)
 
 
-def _find_or_create(api: Api, dataset_id: str, name: str | None, sha256: str, size: int) -> Upload:
-    """Return the upload of this file, a new one unless one is under way."""
+def _find_or_create(api: Api, dataset_id: str, name: str | None, sha256: str, size: int) -> Upload | None:
+    """Return the upload of this file, a new one unless one is under way; None if a ZIP file is stored."""
     metadata = {"sha256": sha256} if name is None else {"path": name, "sha256": sha256}
     encoded = (f"{key} {base64.b64encode(value.encode()).decode()}" for key, value in metadata.items())
     headers = {**_VERSION, "Upload-Length": str(size), "Upload-Metadata": ",".join(encoded)}
@@ -138,9 +141,18 @@ def _find_or_create(api: Api, dataset_id: str, name: str | None, sha256: str, si
         except ServiceError as error:
             if error.status != _NOT_FOUND:  # it was stored or given up since, and the next one may be there
                 raise
+            if name is None and _was_unpacked(api, dataset_id):
+                return None
         else:
             return Upload.from_answer(str(response.headers["Location"]), response.json())
     raise ServiceError(f"The file was sent {MAX_STORED_BEFORE} times before; make a new dataset.")
+
+
+def _was_unpacked(api: Api, dataset_id: str) -> bool:
+    """Return whether the ZIP file whose upload is over has been stored, as after its sender was killed."""
+    tasks = api.iterate_pages(f"/v1/datasets/{dataset_id}/tasks", "tasks")
+    newest = next((task for task in tasks if task["kind"] == "upload"), None)
+    return newest is not None and newest["state"] == "succeeded"
 
 
 def _offset(api: Api, address: str) -> int:

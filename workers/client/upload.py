@@ -6,17 +6,17 @@ from pathlib import Path
 from typing import Any
 
 from octasplat.engine.core.errors import DatasetError
+from octasplat.engine.core.folder_files import files_below
 from octasplat.engine.core.scene_layout import is_ignored_file
 from octasplat.workers.client.api import Api
 from octasplat.workers.client.dataset_files import (
     LocalFile,
-    create_dataset_once,
     describe_unsent,
     put_file,
     send_files,
     sha256_of,
 )
-from octasplat.workers.client.dataset_tasks import commit
+from octasplat.workers.client.dataset_tasks import commit, create_dataset_once
 from octasplat.workers.client.resumable_upload import MIN_RESUMABLE_BYTES, send_resumable
 
 _ARCHIVE_END_BYTES = 1 << 18
@@ -36,8 +36,9 @@ def list_scene_files(
     """
     if not scene.is_dir():
         raise DatasetError(f"{scene} is not a folder; name the folder that holds images/ and sparse/.")
-    found = (path for path in sorted(scene.rglob("*")) if path.is_file())
-    paths = {_replace_non_utf8(path.relative_to(scene).as_posix()): path for path in found}
+    paths = {
+        _replace_non_utf8(path.relative_to(scene).as_posix()): path for path in sorted(files_below(scene))
+    }
     listed = [
         {"path": name, "size_bytes": path.stat().st_size}
         for name, path in paths.items()

@@ -9,6 +9,7 @@ from pathlib import Path
 from threading import Lock, Semaphore
 from typing import Any
 
+from octasplat.engine.core.errors import DatasetError
 from octasplat.workers.client.api import Api, ServiceError
 
 PARALLEL_PARTS = 4
@@ -64,27 +65,66 @@ class FileRange:
         progress: called with how far in the file it has gone out.
     """
 
-    def __init__(self, path: Path, start: int, stop: int, progress: Callable[[int], None]) -> None:
+    def __init__(
+        self, path: Path, start: int, stop: int, progress: Callable[[int], None] = lambda _done: None
+    ) -> None:
         self._path, self._start, self._stop, self._progress = path, start, stop, progress
 
     def __iter__(self) -> Iterator[bytes]:
+        """Yield the content in pieces.
+
+        Raises:
+            DatasetError: the file cannot be read, or has become shorter.
+        """
         offset = self._start
-        with self._path.open("rb") as handle:
-            handle.seek(offset)
-            while offset < self._stop and (piece := handle.read(min(_PIECE_BYTES, self._stop - offset))):
-                yield piece
-                offset += len(piece)
-                self._progress(offset)
+        for piece in self._read_pieces():
+            yield piece
+            offset += len(piece)
+            self._progress(offset)
 
     def sha256(self) -> bytes:
-        """Return the digest of the part."""
-        digest, left = hashlib.sha256(), self._stop - self._start
-        with self._path.open("rb") as handle:
-            handle.seek(self._start)
-            while left and (piece := handle.read(min(_PIECE_BYTES, left))):
-                digest.update(piece)
-                left -= len(piece)
+        """Return the digest of the part.
+
+        Raises:
+            DatasetError: as when it is sent.
+        """
+        digest = hashlib.sha256()
+        for piece in self._read_pieces():
+            digest.update(piece)
         return digest.digest()
+
+    def _read_pieces(self) -> Iterator[bytes]:
+        left = self._stop - self._start
+        try:
+            with self._path.open("rb") as handle:
+                handle.seek(self._start)
+                while left:
+                    piece = handle.read(min(_PIECE_BYTES, left))
+                    if not piece:
+                        raise DatasetError(
+                            f"{self._path} became shorter while it was sent; send it when it is complete."
+                        )
+                    left -= len(piece)
+                    yield piece
+        except OSError as error:
+            raise unreadable_error(self._path, error) from None
+
+
+def file_size(path: Path) -> int:
+    """Return the length of a file.
+
+    Raises:
+        DatasetError: it is not there.
+    """
+    try:
+        return path.stat().st_size
+    except OSError as error:
+        raise unreadable_error(path, error) from None
+
+
+def unreadable_error(path: Path, error: OSError) -> DatasetError:
+    """Return what to tell of a file that cannot be read."""
+    return DatasetError(f"{path} cannot be read ({error.strerror or error}).")
 
 
 def send_parts(

@@ -25,13 +25,14 @@ class AddressRefusedError(OctasplatError):
     error_type = "address_refused"
 
 
-def check_url(url: str, allowed_hosts: tuple[str, ...] = ()) -> str:
+def check_url(url: str, allowed_hosts: tuple[str, ...] = (), *, max_length: int = MAX_URL) -> str:
     """Return the URL if messages may be sent there; a host name is looked up when sending, not here.
 
     Args:
         url: the address.
         allowed_hosts: names or numeric addresses, without a port, that may be inner ones and need neither
             TLS nor a usual port.
+        max_length: characters.
 
     Raises:
         AddressRefusedError: it is none, or leads where it must not.
@@ -43,7 +44,7 @@ def check_url(url: str, allowed_hosts: tuple[str, ...] = ()) -> str:
         raise AddressRefusedError(
             "The address cannot be read; give one such as https://example.org/hook."
         ) from None
-    if len(url) > MAX_URL or any(c.isspace() or not c.isprintable() for c in url) or not host:
+    if len(url) > max_length or any(c.isspace() or not c.isprintable() for c in url) or not host:
         raise AddressRefusedError("The address cannot be read; give one such as https://example.org/hook.")
     if parts.username is not None or parts.password is not None or parts.fragment:
         raise AddressRefusedError("The address must hold no user, password or fragment.")
