@@ -101,6 +101,7 @@ def test_two_blocks_are_as_good_as_the_whole(two_blocks: tuple, whole: Path) -> 
     assert not (whole / "blocks").exists()
 
 
+@pytest.mark.exhaustive
 def test_blocks_that_fit_together_are_finished_together(scene: Path, two_blocks: tuple) -> None:
     """Those that fit into one training all move on, and exposures are learnt again."""
     run, _ = two_blocks

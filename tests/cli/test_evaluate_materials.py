@@ -53,6 +53,7 @@ def scene_with_truth(run, tmp_path_factory) -> Path:
     return root
 
 
+@pytest.mark.exhaustive
 def test_materials_light_and_relit_pictures_are_measured(shiny_run, scene_with_truth, octasplat):
     done = octasplat("evaluate", shiny_run, "--other-dataset", scene_with_truth / "test")
     assert done.exit_code == 0, done.output

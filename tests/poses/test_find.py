@@ -154,6 +154,7 @@ def test_too_few_photographs_are_refused(tmp_path: Path) -> None:
         find_poses(tmp_path / "images", tmp_path / "out")
 
 
+@pytest.mark.exhaustive
 def test_find_poses_too_few_registered_is_refused(taken: Photographs, tmp_path: Path) -> None:
     images = tmp_path / "images"
     images.mkdir()

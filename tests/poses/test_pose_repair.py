@@ -85,6 +85,7 @@ def test_pose_repair_moves_contradicted_photographs(scene: Path, tmp_path: Path)
         assert (again / path.name).read_bytes() == path.read_bytes()
 
 
+@pytest.mark.exhaustive
 def test_pose_repair_without_errors_writes_nothing(scene: Path, tmp_path: Path) -> None:
     model = scene / "sparse" / "0"
     names = tuple(sorted(poses(model)))

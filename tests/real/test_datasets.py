@@ -23,6 +23,7 @@ def scene_folders() -> list[Path]:
     return sorted(path for path in Path(SCENES).iterdir() if (path / "images").is_dir())
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("root", scene_folders(), ids=lambda path: path.name)
 def test_sparse_points_have_the_colors_of_the_photographs(root, tmp_path):
     """Where structure from motion saw a point, its color is found, which proves frames, rays and pixels."""

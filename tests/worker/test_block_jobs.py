@@ -86,6 +86,7 @@ def test_worker_killed_during_a_block_is_replaced(bench: WorkerHarness) -> None:
     assert resumed[0].data["step"] == 5
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("damage", ["gone", "damaged"])
 def test_results_lost_from_the_store_are_made_again(bench: WorkerHarness, damage: str) -> None:
     for number in range(2):
@@ -161,6 +162,7 @@ def test_retry_from_the_start_plans_anew(bench: WorkerHarness) -> None:
     assert before.isdisjoint(child.id for child in blocks(bench, root))
 
 
+@pytest.mark.exhaustive
 def test_lost_database_in_the_middle_is_outlived(bench: WorkerHarness) -> None:
     bench.worker(**KINDS)
     root = submit(bench, hold=1)

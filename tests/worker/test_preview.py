@@ -86,6 +86,7 @@ def test_previews_do_not_change_training(scene: Path, tmp_path: Path, clock: Clo
         assert (run / name).read_bytes() == expected and (drawn_often / name).read_bytes() == expected
 
 
+@pytest.mark.exhaustive
 def test_preview_shows_materials(scene: Path, tmp_path: Path) -> None:
     """The newest picture is what the shading model of the training makes of the view, not its harmonics."""
     run = tmp_path / "run"

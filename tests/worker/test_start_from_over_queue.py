@@ -154,6 +154,7 @@ def test_unsuitable_start_is_refused_with_the_name_of_its_job(
     assert message.startswith(f"job {stopped} has ") and "this run may have 50" in message, message
 
 
+@pytest.mark.exhaustive
 def test_training_goes_on_with_its_own_copy_of_what_is_gone(
     shared_bench: WorkerHarness, dataset: uuid.UUID, stopped: uuid.UUID
 ) -> None:
