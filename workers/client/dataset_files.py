@@ -41,7 +41,7 @@ def send_files(
         api: the service.
         dataset_id: the dataset, which is open.
         files: by name.
-        progress: called with (bytes done, total).
+        progress: called with (bytes sent, total); what need not be sent leaves the total.
 
     Returns:
         Those files that were not sent, as the dataset, or another one of its owner, has them already.
@@ -86,7 +86,7 @@ def send_files(
                         jobs.append(sending.submit(send, file, digest))
                     else:
                         unsent.append(file)
-                        counter.add(file.size_bytes)
+                        counter.leave_out(file.size_bytes)
                 _raise_failure(jobs)
             wait(jobs, return_when=FIRST_EXCEPTION)
         finally:
@@ -242,6 +242,12 @@ class ProgressCounter:
         """Count bytes that have gone out."""
         with self._lock:
             self._done += count
+            self._progress(self._done, self._total)
+
+    def leave_out(self, count: int) -> None:
+        """Count bytes of the total as none that go out."""
+        with self._lock:
+            self._total -= count
             self._progress(self._done, self._total)
 
 
