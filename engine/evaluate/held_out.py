@@ -1,7 +1,7 @@
 """Renders the held-out views, measures them, and writes their pictures, ``metrics.json`` and the report."""
 
 from collections.abc import Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from jaxtyping import Float32
 
 from octasplat.engine.core.color import composite_over
 from octasplat.engine.core.events import EventListener, PhaseProgress, Warned, read_events
+from octasplat.engine.core.read_ahead import read_ahead
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.evaluate.advice import ViewFacts, advise, fine_detail, support_groups
@@ -228,13 +229,10 @@ def _measure_views(
     if workers == 1:
         yield from ((view, measure_view(view)) for view in views)
         return
-    waiting: list[tuple[RenderedView, Future[MeasuredView]]] = []
+
+    def measure(view: RenderedView) -> tuple[RenderedView, MeasuredView]:
+        return view, measure_view(view)
+
     with ThreadPoolExecutor(workers) as pool:
-        for view in views:
-            waiting.append((view, pool.submit(measure_view, view)))
-            # No more may wait, as each view holds several pictures.
-            if len(waiting) > workers:
-                first, future = waiting.pop(0)
-                yield first, future.result()
-        for view, future in waiting:
-            yield view, future.result()
+        # No more may wait, as each view holds several pictures.
+        yield from read_ahead(measure, views, pool, workers + 1)
