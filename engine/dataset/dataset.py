@@ -239,6 +239,8 @@ class Dataset:
         origin_world: Origin = NO_ORIGIN,
         max_side: int | None = None,
         masks: MaskUse = "ignore",
+        model_folder: Path | None = None,
+        model: str | None = None,
         threads: int = 0,
         progress: Callable[[int, int], None] | None = None,
     ) -> "Dataset":
@@ -251,6 +253,8 @@ class Dataset:
             origin_world: local origin of the scene.
             max_side: cap on the longer side of the photographs, in pixels.
             masks: as in :meth:`open`.
+            model_folder: as in :meth:`open`.
+            model: as in :meth:`open`.
             threads: decoding threads; 0 takes one per processor.
             progress: called with (photographs done, total) while decoding.
 
@@ -259,8 +263,9 @@ class Dataset:
             OutputError: the cache cannot be written.
         """
         scene = load_dataset_model(
-            root, max_side=max_side, min_views=1, for_training=False, origin_world=origin_world
-        )
+            root, max_side=max_side, model_folder=model_folder, model=model, min_views=1, for_training=False,
+            origin_world=origin_world,
+        )  # fmt: skip
         if masks == "alpha":
             require_masks(scene)
         cache = open_pixel_cache(scene, cache_dir, threads=threads, progress=progress)

@@ -38,6 +38,7 @@ from octasplat.engine.runs.run_folder import (
     TRAINING,
     VIEWS,
     found_model_folder,
+    has_photographs_of_run,
     open_run_dataset,
     photographs_folder,
     run_environment,
@@ -276,6 +277,7 @@ def _evaluate_on(
     name = on.resolve().name
     into = output / EVALUATIONS / name
     find_ground_truth(on)  # complains before anything is written
+    is_own = has_photographs_of_run(output, on)  # whose poses may have been found or mended
     dataset = Dataset.open_for_evaluation(
         on,
         output / CACHE / EVALUATIONS / name,
@@ -283,6 +285,8 @@ def _evaluate_on(
         origin_world=read_metadata(output).origin_world,
         max_side=config.max_side,
         masks=config.masks,
+        model_folder=found_model_folder(output) if is_own else None,
+        model=config.model if is_own else None,
         threads=threads,
         progress=lambda done, total: progress(PhaseProgress("load", done, total)),
     )

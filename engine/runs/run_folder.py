@@ -14,7 +14,11 @@ from octasplat.engine.core.local_origin import Origin
 from octasplat.engine.dataset import Dataset, load_dataset_model
 from octasplat.engine.dataset.camera_clearance import CameraClearance
 from octasplat.engine.dataset.dataset_part import open_dataset_part
+from octasplat.engine.dataset.image_names import match_image_names
+from octasplat.engine.dataset.model_sources import has_model
 from octasplat.engine.dataset.photograph_facts import PhotographFacts
+from octasplat.engine.dataset.photograph_files import image_folder, photographs_below
+from octasplat.engine.dataset.pixel_cache import file_sha256
 from octasplat.engine.dataset.region import Region
 from octasplat.engine.dataset.scene_split import SplitRule
 from octasplat.engine.dataset.view_frusta import ViewFrusta
@@ -38,6 +42,8 @@ of a pixel, so that a dark channel beside a bright one is coarse."""
 BACKGROUND = "background.exr"
 EVALUATIONS = "on"
 """Below it are the measures on photographs of other folders, a folder each."""
+_COMPARED_PHOTOGRAPHS = 8
+"""So many of a run, evenly by name, tell its photographs from others: hashing all may take long."""
 
 
 def is_run(source: Path) -> bool:
@@ -94,11 +100,13 @@ def run_viewpoints(
     max_side = max_side or config.max_side
     if scene is None and (output / VIEWS).exists():  # no photographs are needed
         return read_views(output / VIEWS).viewpoints(max_side)
+    folder = photographs_folder(output, scene)
+    model_folder, model = model_of_photographs(output, folder, config)
     photographs = load_dataset_model(
-        photographs_folder(output, scene),
+        folder,
         max_side=max_side,
-        model_folder=found_model_folder(output),
-        model=config.model,
+        model_folder=model_folder,
+        model=model,
         origin_world=run_origin(output),
     )
     rule = SplitRule(
@@ -209,6 +217,48 @@ def found_model_folder(output: Path) -> Path | None:
         if any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
             return folder
     return None
+
+
+def has_photographs_of_run(output: Path, folder: Path) -> bool:
+    """Return whether a folder holds the photographs that a run was made from.
+
+    False elsewhere than in the recorded folder, if the run keeps no views.
+
+    Raises:
+        ConfigError: ``output`` is no run.
+    """
+    if folder.resolve() == dataset_folder_of_run(output):
+        return True
+    if not (output / VIEWS).exists():
+        return False
+    digests = {view.name: view.photograph_sha256 for view in read_views(output / VIEWS).views}
+    names = sorted(digests)
+    places = np.linspace(0, len(names) - 1, min(len(names), _COMPARED_PHOTOGRAPHS)).round().astype(np.int64)
+    files = photographs_below(image_folder(folder))
+    found = match_image_names(names, files.keys())
+    return all(
+        name in found and file_sha256(files[found[name]]) == digests[name]
+        for name in (names[place] for place in places.tolist())
+    )
+
+
+def model_of_photographs(
+    output: Path, folder: Path, config: ReconstructionConfig
+) -> tuple[Path | None, str | None]:
+    """Return the folder of found poses and the chosen model with which photographs are opened for a run.
+
+    Other photographs than the run's stand where their own model says.
+
+    Args:
+        output: folder of the run.
+        folder: of the photographs.
+        config: of the run.
+
+    Raises:
+        ConfigError: ``output`` is no run.
+    """
+    is_other = (output / VIEWS).exists() and has_model(folder) and not has_photographs_of_run(output, folder)
+    return (None, None) if is_other else (found_model_folder(output), config.model)
 
 
 def _region(config: ReconstructionConfig) -> Region | None:

@@ -19,8 +19,8 @@ from octasplat.engine.runs.config import read_config
 from octasplat.engine.runs.run_folder import (
     CONFIG,
     VIEWS,
-    found_model_folder,
     is_run,
+    model_of_photographs,
     open_run_dataset,
     photographs_folder,
     run_exposures,
@@ -90,7 +90,8 @@ def training_photographs(
         return ()
     instead = "Colors are those that the scene shows, not those of photographs"
     try:
-        folder, model = photographs_folder(source, dataset or copy), found_model_folder(source)
+        folder = photographs_folder(source, dataset or copy)
+        model, _ = model_of_photographs(source, folder, config)
     except DatasetError as error:
         progress(Noted(f"{instead}. {error}"))
         return ()

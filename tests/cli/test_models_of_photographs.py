@@ -1,0 +1,73 @@
+"""Photographs that a command names: those of the run have its poses, others those of their own model."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image, ImageOps
+
+from octasplat.engine.dataset import load_dataset_model
+from octasplat.engine.runs.run_folder import has_photographs_of_run, run_viewpoints
+
+
+@pytest.fixture
+def posed_run(run, tmp_path) -> Path:
+    """The run of the other tests as if octasplat had found the poses of its photographs."""
+    output = shutil.copytree(run.output, tmp_path / "run", ignore=shutil.ignore_patterns("on", "cache"))
+    shutil.copytree(run.scene / "images", tmp_path / "bare" / "images")
+    shutil.copytree(run.scene / "sparse" / "0", output / "poses")
+    content = json.loads((output / "config.json").read_text())
+    content["scene"] = str((tmp_path / "bare").resolve())
+    (output / "config.json").write_text(json.dumps(content))
+    return output
+
+
+@pytest.fixture
+def others(run, tmp_path) -> Path:
+    """Other photographs of the same names, which stand aside of those of the run."""
+    folder = tmp_path / "others"
+    for name in ("images", "sparse"):
+        shutil.copytree(run.scene / name, folder / name)
+    for path in (folder / "images").iterdir():
+        ImageOps.invert(Image.open(path).convert("RGB")).save(path)
+    model = pycolmap.Reconstruction(folder / "sparse" / "0")
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), [0.1, 0.0, 0.0]))
+    model.write(folder / "sparse" / "0")
+    return folder
+
+
+def test_evaluate_all_views_of_run_with_found_poses(posed_run, octasplat):
+    done = octasplat("evaluate", posed_run, "--all-views", "--threads", 1)
+    assert done.exit_code == 0, done.output
+    metrics = json.loads((posed_run / "on" / "bare" / "metrics.json").read_text())
+    assert len(metrics["views"]) == 8
+    held_out = json.loads((posed_run / "metrics.json").read_text())["views"]
+    for name, measured in held_out.items():
+        assert metrics["views"][name]["psnr"] == pytest.approx(measured["psnr"])
+
+
+def test_evaluate_other_photographs_without_model_is_refused(posed_run, others, octasplat):
+    shutil.rmtree(others / "sparse")
+    refused = octasplat("evaluate", posed_run, "--other-dataset", others, "--threads", 1)
+    assert refused.exit_code == 1 and "holds no COLMAP model" in refused.stderr
+
+
+def test_cameras_of_other_photographs_are_those_of_their_model(posed_run, others):
+    assert has_photographs_of_run(posed_run, posed_run.parent / "bare")
+    assert not has_photographs_of_run(posed_run, others)
+    expected = {view.name: view.origin_world for view in load_dataset_model(others).views}
+    found = run_viewpoints(posed_run, scene=others)
+    assert len(found.views) == 8
+    for view in found.views:
+        np.testing.assert_allclose(view.origin_world, expected[view.name])
+
+
+def test_photographs_of_run_elsewhere_have_its_poses(posed_run, run):
+    assert has_photographs_of_run(posed_run, run.scene)
+    kept = run_viewpoints(posed_run)
+    moved = run_viewpoints(posed_run, scene=run.scene)
+    for mine, theirs in zip(kept.views, moved.views, strict=True):
+        np.testing.assert_allclose(mine.origin_world, theirs.origin_world)
