@@ -43,12 +43,14 @@ def merge_metadata(scenes: Sequence[tuple[FlatGaussians, SceneMetadata]]) -> Sce
     Scenes are put together as they stand, so that a georeference holds if no scene has another. Whether
     normals have a side is for those to say that have materials, as no others are lit by them.
     """
-    places = {facts.georeference for _, facts in scenes if facts.georeference is not None}
+    known = [facts.georeference for _, facts in scenes if facts.georeference is not None]
+    # scene files keep neither the method nor the residuals
+    places = {(place.crs, place.anchor, place.matrix) for place in known}
     lit = [facts.turned_beyond for gaussians, facts in scenes if ALBEDO in gaussians.channels]
     return SceneMetadata(
         near_world=min(facts.near_world for _, facts in scenes),
         pixel_rad=min(facts.pixel_rad for _, facts in scenes),
         turned_beyond=min(lit, default=0.0),
         origin_world=scenes[0][1].origin_world,
-        georeference=next(iter(places)) if len(places) == 1 else None,
+        georeference=known[0] if len(places) == 1 else None,
     )
