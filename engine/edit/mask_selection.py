@@ -14,7 +14,7 @@ from octasplat.engine.render.image_files import read_image
 from octasplat.engine.render.renderer import tile_order
 from octasplat.engine.render.shots import view_shots
 from octasplat.engine.runs.config import read_config
-from octasplat.engine.runs.run_folder import CONFIG, is_run, run_min_view_distance, run_viewpoints
+from octasplat.engine.runs.run_folder import CONFIG, is_full_run, run_min_view_distance, run_viewpoints
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import TraceGradients, Tracer
 
@@ -36,7 +36,7 @@ def select_by_masks(
     Raises:
         ConfigError: the source is no run, or an image is no mask of its photographs.
     """
-    if not is_run(source):
+    if not is_full_run(source):
         raise ConfigError(f"{source}: masks need the folder of a run, which knows its cameras.")
     config, viewpoints = read_config(source / CONFIG), run_viewpoints(source)
     near_world = run_min_view_distance(source, viewpoints)

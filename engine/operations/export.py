@@ -316,16 +316,16 @@ class _ExportPreparation:
 
         from octasplat.engine.render.bake_color import colors_along, with_constant_color
         from octasplat.engine.runs.baked_scene import BakedScene
-        from octasplat.engine.runs.run_folder import is_run
+        from octasplat.engine.runs.run_folder import is_full_run
 
         gaussians, source = self._gaussians, self._request.source
-        color = self._request.color or ("cameras" if is_run(source) else "constant")
+        color = self._request.color or ("cameras" if is_full_run(source) else "constant")
         if color == "constant" or gaussians.sh_degree == 0:
             return gaussians
         if color == "cameras":
             return BakedScene(
                 gaussians,
-                source if is_run(source) else None,
+                source if is_full_run(source) else None,
                 threads=self._threads,
                 on_pass=lambda _done, _total: self._on_pass(),
                 on_unknown=lambda text: self._progress(Warned(text)),

@@ -164,17 +164,18 @@ def run(
     from octasplat.engine.render.render_digest import render_digest
     from octasplat.engine.render.shots import camera_shots
     from octasplat.engine.runs.config import read_config
-    from octasplat.engine.runs.run_folder import CONFIG, SCENE, is_run
+    from octasplat.engine.runs.run_folder import CONFIG, SCENE, is_full_run, is_run
 
     report = stop_when_asked(progress, should_stop)
     for sentence in request.unused():
         report(Warned(sentence))
-    of_run = is_run(request.source)
+    of_run = is_full_run(request.source)
     environments = read_environments(
         request.environments, request.clamp, lambda sentence: report(Warned(sentence))
     )
     source = read_render_source(request.source, report, dataset=request.dataset, max_side=request.max_side)
-    require_materials(source.gaussians, request.source / SCENE if of_run else request.source)
+    scene_file = request.source / SCENE if is_run(request.source) else request.source
+    require_materials(source.gaussians, scene_file)
     learnt = read_config(request.source / CONFIG).train.materials if of_run else None
     up = light_up(request.source, request.up)
     cameras = None if request.other_dataset is not None else requested_cameras(request, source)

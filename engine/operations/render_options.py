@@ -258,9 +258,9 @@ class PictureRequest(PictureOptions, WritingRequest):
         if found:
             return found.pop()
         # imported late: numba and scipy come with it
-        from octasplat.engine.runs.run_folder import is_run
+        from octasplat.engine.runs.run_folder import is_full_run
 
-        return "views" if is_run(Path(given["source"])) else "turntable"
+        return "views" if is_full_run(Path(given["source"])) else "turntable"
 
     @model_validator(mode="after")
     def _output_fits(self) -> "PictureRequest":
@@ -293,9 +293,9 @@ class PictureRequest(PictureOptions, WritingRequest):
 
     @property
     def _has_views(self) -> bool:
-        from octasplat.engine.runs.run_folder import is_run
+        from octasplat.engine.runs.run_folder import is_full_run
 
-        return is_run(self.source)
+        return is_full_run(self.source)
 
 
 def check_layers(output: Path) -> None:

@@ -40,7 +40,7 @@ from octasplat.engine.runs.finished_shading import finished_shading, shown_optio
 from octasplat.engine.runs.run_folder import (
     CONFIG,
     SCENE,
-    is_run,
+    is_full_run,
     run_extent,
     run_min_view_distance,
     run_viewpoints,
@@ -121,7 +121,7 @@ def read_render_source(
             nothing.
         OctasplatError: it cannot be read.
     """
-    if not is_run(source):
+    if not is_full_run(source):
         if dataset is not None:
             raise ConfigError(
                 f"{source}: is no folder of a run, so that {dataset} says nothing about it; leave that "

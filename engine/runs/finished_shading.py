@@ -11,7 +11,7 @@ from octasplat.engine.runs.config import read_config
 from octasplat.engine.runs.run_folder import (
     BACKGROUND,
     CONFIG,
-    is_run,
+    is_full_run,
     run_environment,
     run_exposures,
     run_extent,
@@ -51,7 +51,7 @@ def learned_materials(output: Path, gaussians: FlatGaussians) -> DeferredShading
     Raises:
         ConfigError: the run learnt light and its file is missing or damaged.
     """
-    if not (is_run(output) and has_materials(gaussians)):
+    if not (is_full_run(output) and has_materials(gaussians)):
         return None
     options = shown_options(read_config(output / CONFIG).train, gaussians)
     if options.materials is None:

@@ -52,6 +52,11 @@ def is_run(source: Path) -> bool:
     return source.is_dir() and not (source / "meta.json").exists()
 
 
+def is_full_run(source: Path) -> bool:
+    """Return whether ``source`` is a run folder, and not one that an edit has left with the scene alone."""
+    return is_run(source) and ((source / CONFIG).exists() or not (source / SCENE).exists())
+
+
 def dataset_folder_of_run(output: Path) -> Path:
     """Return the dataset folder that a run was trained on.
 

@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
+import octasplat as osp
 from octasplat.engine.dataset.views_file import read_views
 from octasplat.engine.edit.run_transform import rotate_environment
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
@@ -115,6 +116,25 @@ def test_transform_with_shear_writes_scene_only(run, octasplat, tmp_path):
         assert names(tmp_path / "out") == {"scene.ply", "edits.json"}
         for path in (tmp_path / "out").iterdir():
             path.unlink()
+
+
+def test_scene_that_a_transform_left_alone_is_shown(shiny_run, octasplat, tmp_path):
+    alone = tmp_path / "alone"
+    assert octasplat("transform", shiny_run, "--scale", -1, "-o", alone).exit_code == 0
+    small = ("--width", 32, "--height", 32, "--threads", 1)
+    for command in (
+        ("info", alone),
+        ("render", alone, "--frames", 2, *small, "-o", tmp_path / "around"),
+        ("render", alone, "--camera", 0, 0, -4, *small, "-o", tmp_path / "one.png"),
+        ("stage", "init", alone, "-o", tmp_path / "stage.toml"),
+        ("export", alone, tmp_path / "octagons.obj"),
+    ):
+        done = octasplat(*command)
+        assert done.exit_code == 0 and "config.json" not in done.output, done.output
+    assert len(list((tmp_path / "around").iterdir())) == 2
+    refused = octasplat("render", alone, "--views", "all", "-o", tmp_path / "views")
+    assert refused.exit_code == 2 and "views of photographs need the folder of a run" in refused.stderr
+    assert osp.load(alone).materials is None
 
 
 def test_crop_clean_merge_record_edits_in_run(run, octasplat, tmp_path):
