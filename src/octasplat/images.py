@@ -157,8 +157,7 @@ def render_view(
 
 def _build_tracer(scene: Scene, threads: int, materials: "DeferredShading | None" = None) -> "Tracer":
     from octasplat.engine.trace.factory import make_tracer
-    from octasplat.engine.trace.protocol import TraceSettings
 
-    tracer = make_tracer(TraceSettings(flip_normal_cos=scene.facts.turned_beyond), threads=threads)
+    tracer = make_tracer(scene.trace_settings, threads=threads)
     tracer.build(scene.gaussians, None if materials is None else materials.features(scene.gaussians))
     return tracer

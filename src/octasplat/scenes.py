@@ -21,6 +21,7 @@ from octasplat.paths import PathLike
 if TYPE_CHECKING:
     from octasplat.engine.render.pinhole_camera import PinholeCamera
     from octasplat.engine.shading.deferred import DeferredShading
+    from octasplat.engine.trace.protocol import TraceSettings
 
 
 class Scene:
@@ -45,6 +46,7 @@ class Scene:
         gaussians: FlatGaussians,
         facts: SceneMetadata = UNKNOWN_METADATA,
         materials: "DeferredShading | None" = None,
+        trained_with: "TraceSettings | None" = None,
     ) -> None:
         """Take over the engine's Gaussians; :meth:`from_arrays` makes a scene of plain arrays.
 
@@ -52,10 +54,12 @@ class Scene:
             gaussians: the scene.
             facts: what a file says of it as a whole.
             materials: shading of its materials in the light that a run has learnt.
+            trained_with: how a run has traced it; None where that is not known.
         """
         self.gaussians = gaussians
         self.facts = facts
         self.materials = materials
+        self.trained_with = trained_with
 
     @classmethod
     def from_arrays(
@@ -189,11 +193,18 @@ class Scene:
         >>> len(scene.select(scene.opacities > 0.5)) < len(scene)
         True
         """
-        return Scene(self.gaussians.select(index), self.facts, self.materials)
+        return Scene(self.gaussians.select(index), self.facts, self.materials, self.trained_with)
 
     def copy(self) -> "Scene":
         """Return an independent copy."""
-        return Scene(self.gaussians.copy(), self.facts, self.materials)
+        return Scene(self.gaussians.copy(), self.facts, self.materials, self.trained_with)
+
+    @property
+    def trace_settings(self) -> "TraceSettings":
+        """Return how rays are traced: as the run of the scene has, or as its file says."""
+        from octasplat.engine.trace.protocol import TraceSettings
+
+        return self.trained_with or TraceSettings(flip_normal_cos=self.facts.turned_beyond)
 
     def camera(self, width: int = 640, height: int = 480, *, fov: float = 50.0) -> "PinholeCamera":
         """Return a camera that sees the whole scene; ``fov`` is its angle of view in degrees, down.
@@ -287,8 +298,8 @@ def _opacity_logits(opacities: Float[np.ndarray, "..."]) -> Float64[np.ndarray, 
 def load(source: PathLike, *, drop_invalid: bool = False) -> Scene:
     """Return the scene of a file of any format, or of a run.
 
-    With a run comes the light that it has learnt, if it has materials; :func:`octasplat.render` shows them in
-    it. What reading loses, as the thickness of Gaussians that were not flat, is logged.
+    With a run comes how it has traced rays, and the light that it has learnt, if it has materials;
+    :func:`octasplat.render` shows them in it. What reading loses, as the thickness of Gaussians that were not flat, is logged.
 
     Args:
         source: the file, a run or its folder, or the folder of an unpacked SOG.
@@ -296,7 +307,7 @@ def load(source: PathLike, *, drop_invalid: bool = False) -> Scene:
 
     Raises:
         SceneFileError: the file cannot be read.
-        ConfigError: a run's light cannot be read.
+        ConfigError: a run's settings or light cannot be read.
 
     >>> import octasplat as osp
     >>> osp.load("scene.ply")
@@ -310,14 +321,18 @@ def read_scene(path: Path, progress: EventListener, *, drop_invalid: bool = Fals
 
     Raises:
         SceneFileError: the file cannot be read.
-        ConfigError: a run's light cannot be read.
+        ConfigError: a run's settings or light cannot be read.
     """
     from octasplat.engine.files import read_metadata
     from octasplat.engine.operations.scene_io import open_scene
+    from octasplat.engine.runs.config import read_config
     from octasplat.engine.runs.finished_shading import learned_materials
+    from octasplat.engine.runs.run_folder import CONFIG, is_full_run
 
     gaussians = open_scene(path, progress, drop_invalid=drop_invalid)
-    return Scene(gaussians, read_metadata(path), learned_materials(path, gaussians))
+    materials = learned_materials(path, gaussians)
+    settings = read_config(path / CONFIG).train.trace if is_full_run(path) else None
+    return Scene(gaussians, read_metadata(path), materials, settings)
 
 
 def save(scene: Scene, path: PathLike) -> Path:

@@ -36,6 +36,7 @@ class GaussianTensors:
         sh: spherical harmonics of the display color; color = max(0, 1/2 + sum_k sh[k] Y_k(direction)).
         features: any further numbers, composited like colors.
         facts: what is known of the scene as a whole; it decides how the scene is traced.
+        trained_with: how the run of the scene has traced it, which comes before that; None of a file.
 
     >>> import octasplat as osp
     >>> parameters = osp.GaussianTensors.of(osp.load("scene.ply"))
@@ -52,6 +53,7 @@ class GaussianTensors:
     sh: Float[Tensor, "n k 3"]
     features: Float[Tensor, "n f"] | None = None
     facts: SceneMetadata = UNKNOWN_METADATA
+    trained_with: TraceSettings | None = None
 
     @classmethod
     def of(cls, scene: Scene, *, requires_grad: bool = True) -> "GaussianTensors":
@@ -59,7 +61,9 @@ class GaussianTensors:
         arrays = (scene.means, scene.quats, scene.log_scales, scene.opacity_logits, scene.sh)
         leaves = [torch.tensor(array, requires_grad=requires_grad) for array in arrays]
         means, quats, log_scales, opacity_logits, sh = leaves
-        return cls(means, quats, log_scales, opacity_logits, sh, facts=scene.facts)
+        return cls(
+            means, quats, log_scales, opacity_logits, sh, facts=scene.facts, trained_with=scene.trained_with
+        )
 
     def tensors(self) -> list[Tensor]:
         """Return the tensors, as an optimiser takes them; no features where there are none."""
@@ -71,7 +75,7 @@ class GaussianTensors:
         """Return the scene with these parameters, copied."""
         # without the features, which a scene does not hold
         gaussians = _as_flat_gaussians(*(_as_float32(tensor) for tensor in self.tensors()[:5]))
-        return Scene(gaussians.copy(), self.facts)
+        return Scene(gaussians.copy(), self.facts, trained_with=self.trained_with)
 
 
 @dataclass
@@ -161,7 +165,7 @@ def trace(
     Args:
         scene: parameters; a :class:`Scene` is taken as it is, without gradients.
         rays: rays, or a camera for those through its pixels, row by row.
-        settings: where rays are cut off.
+        settings: where rays are cut off; None takes those of the scene's run, or the usual ones.
         threads: 0 takes all cores.
 
     >>> import octasplat as osp
@@ -176,7 +180,7 @@ def trace(
     """
     given = GaussianTensors.of(scene, requires_grad=False) if isinstance(scene, Scene) else scene
     if settings is None:
-        settings = TraceSettings(flip_normal_cos=scene.facts.turned_beyond)
+        settings = scene.trained_with or TraceSettings(flip_normal_cos=scene.facts.turned_beyond)
     lines = Rays.of(rays) if isinstance(rays, PinholeCamera) else rays
     # By torch, so that the gradients of directions of any length are right.
     directions = lines.directions / lines.directions.norm(dim=-1, keepdim=True)

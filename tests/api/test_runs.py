@@ -1,6 +1,8 @@
 """Runs from Python: begun, stopped, gone on with, in threads, with their progress told."""
 
+import json
 import logging
+import shutil
 import threading
 from pathlib import Path
 from typing import Any
@@ -10,6 +12,7 @@ import pytest
 
 import octasplat as osp
 from octasplat.engine.core.events import Event, PhaseFinished, TrainingProgress
+from octasplat.engine.render.image_files import read_image
 from tests.support.small_run import RUN_OPTIONS
 
 
@@ -134,8 +137,27 @@ def test_run_images_match_operation_result(finished_run: Path, tmp_path: Path) -
         osp.render(osp.load(finished_run), tmp_path / "views")  # type: ignore[call-overload]
 
 
+def test_scene_of_run_is_traced_as_the_run_was(finished_run: Path, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(finished_run, tmp_path / "run"))
+    content = json.loads((run / "config.json").read_text())
+    content["reconstruction"]["train"]["trace"] |= {"q": 4.0, "transmittance_min": 0.3}
+    (run / "config.json").write_text(json.dumps(content))
+    scene = osp.load(run)
+    camera = scene.camera(width=48, height=36)
+    pose = {"camera_to_world": camera.world_from_cam.tolist(), "fov_y_degrees": 50.0}
+    path = {"width": 48, "height": 36, "frames": [pose]}
+    osp.render(run, tmp_path / "shown.exr", camera_path=path, background="black")
+    shown = read_image(tmp_path / "shown.exr")
+    image = osp.render(scene, camera)
+    np.testing.assert_allclose(image.alpha, shown[..., 3], atol=1e-5)
+    for of_run in (scene, scene.copy(), osp.GaussianTensors.of(scene, requires_grad=False)):
+        traced = osp.trace(of_run, camera).alpha.numpy().reshape(36, 48)
+        np.testing.assert_allclose(traced, shown[..., 3], atol=1e-5)
+    of_file = osp.render(osp.load(run / "scene.ply"), camera)
+    assert np.abs(of_file.alpha - image.alpha).max() > 0.01  # a file does not say
+
+
 def test_viewer_of_run_has_cameras(finished_run: Path) -> None:
-    import json
     import urllib.request
 
     with (
