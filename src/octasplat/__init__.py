@@ -43,6 +43,7 @@ if TYPE_CHECKING:
         plan,
         reconstruct,
         relight,
+        simplify,
         stage_init,
         surface,
         transform,

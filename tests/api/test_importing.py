@@ -1,8 +1,12 @@
 """What ``import octasplat`` loads, and how long that takes."""
 
+import ast
 import json
 import subprocess
 import sys
+from pathlib import Path
+
+import octasplat
 
 CODE = """
 import json, sys, time
@@ -23,3 +27,10 @@ def test_import_loads_no_heavy_modules() -> None:
     assert loaded == [] and client == [] and lists_public
     assert seconds < 0.5
     assert done.stderr == ""
+
+
+def test_type_checkers_see_all_public_names() -> None:
+    tree = ast.parse(Path(octasplat.__file__).read_text(encoding="utf-8"))
+    (seen,) = (node for node in tree.body if isinstance(node, ast.If))
+    imported = [name for node in ast.walk(seen) if isinstance(node, ast.ImportFrom) for name in node.names]
+    assert {name.asname or name.name for name in imported} == set(octasplat.__all__) - {"__version__"}
