@@ -155,12 +155,14 @@ class PictureOptions(Options):
 
     def unused(self) -> tuple[str, ...]:
         """Return a sentence for each given option that has no effect on such images."""
+        is_placed = self.mode in ("turntable", "camera")
         rules = {
             "max_side": ("The longer side", "views of photographs", self.mode == "views"),
+            "frames": ("The number of images of a turn", "a turntable", self.mode == "turntable"),
             "seconds": ("The duration of a turn", "a turntable", self.mode == "turntable"),
-            "fov_y_degrees": (
-                "The field of view", "a turntable or a single camera", self.mode in ("turntable", "camera"),
-            ),
+            "width_px": ("The width", "a turntable or a single camera", is_placed),
+            "height_px": ("The height", "a turntable or a single camera", is_placed),
+            "fov_y_degrees": ("The field of view", "a turntable or a single camera", is_placed),
             "fps": (
                 "The number of images per second",
                 "a video",
@@ -170,7 +172,7 @@ class PictureOptions(Options):
         return tuple(
             f"{noun} ({name}) goes with {whose} and is passed over."
             for name, (noun, whose, is_used) in rules.items()
-            if not is_used and getattr(self, name) is not None
+            if not is_used and getattr(self, name) != type(self).model_fields[name].default
         )
 
     @model_validator(mode="after")
