@@ -13,6 +13,7 @@ from pydantic import Field, PlainSerializer
 from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.core.events import EventListener, ignore_events
 from octasplat.engine.core.local_origin import Origin
+from octasplat.engine.core.threads import use_threads
 from octasplat.engine.edit.axes import AXIS_ROTATIONS, Axes
 from octasplat.engine.edit.reports import DeformReport
 from octasplat.engine.files import ImportedMesh, read_mesh, read_metadata
@@ -105,6 +106,7 @@ def run(
     from octasplat.engine.operations.scene_io import describe_edit, open_scene
     from octasplat.engine.operations.sequences import SceneSequence
 
+    use_threads(threads)
     source: Path = request.source
     paths = expand_patterns(request.deformed)
     frames = SceneSequence("deform", request, paths, [request.proxy])

@@ -8,6 +8,7 @@ from typing import Annotated
 from pydantic import Field
 
 from octasplat.engine.core.events import EventListener, ignore_events
+from octasplat.engine.core.threads import use_threads
 from octasplat.engine.edit.edit_options import MeshToGaussiansOptions
 from octasplat.engine.edit.reports import EditReport
 from octasplat.engine.operations.base import (
@@ -72,6 +73,7 @@ def run(
     from octasplat.engine.operations.scene_io import describe_edit, open_scene
     from octasplat.engine.operations.sequences import SceneSequence
 
+    use_threads(threads)
     source: Path = request.source
     meshes = expand_patterns(request.meshes)
     recovery: MeshToGaussiansOptions = request

@@ -91,7 +91,7 @@ def run(
     if request.mesh is not None:
         chosen &= in_mesh(gaussians, read_mesh(request.mesh).about(origin), request.mesh)
     if request.masks:
-        chosen &= select_by_masks(source, gaussians, request.masks)
+        chosen &= select_by_masks(source, gaussians, request.masks, threads=threads)
     if request.inverse:
         chosen = ~chosen
     changed = change_materials(source, gaussians, chosen, request)
