@@ -82,7 +82,7 @@ class ScenePoints:
         if view is not None:
             return self._dataset.views[self._index[view]].origin_world + self._origin
         points = self._dataset.points
-        if name.isdigit() and len(place := np.flatnonzero(points.ids == int(name))):
+        if name.isdecimal() and len(place := np.flatnonzero(points.ids == int(name))):
             return points.xyz_world[place[0]].astype(np.float64) + self._origin
         return None
 

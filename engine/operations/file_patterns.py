@@ -32,7 +32,7 @@ def _natural_sort_key(name: str) -> list[tuple[int, int, str]]:
     """Return a sort key in which 10 comes after 9."""
     return [
         # numbers sort before texts, so that parts of both kinds compare
-        (0, int(part), "") if part.isdigit() else (1, 0, part)
+        (0, int(part), "") if part.isdecimal() else (1, 0, part)
         for part in re.split(r"(\d+)", name)
         if part
     ]

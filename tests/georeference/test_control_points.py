@@ -155,6 +155,7 @@ def test_known_length_corrects_the_scale_of_gps(scene, tmp_path):
         ("EPSG:32632\n1 2 3 10 10 NAME a\n1 2 3 900 10 OTHER a", "line 3: 900, 10 is outside of"),
         ("EPSG:32632\n1 2 3 10 10 NAME a\n1 2 3 10 10 OTHER a", "meet in no point|are 1, where 3"),
         ("name,x,y,z\nnobody,1,2,3", "nobody has no mark"),
+        ("name,x,y,z\n\u00b2,1,2,3", "\u00b2 has no mark"),
         ("EPSG:32632", "holds no control points"),
     ],
 )
