@@ -13,6 +13,7 @@ from octasplat.engine.core.events import CheckpointWritten, Event, Noted, Warned
 from octasplat.engine.files import export_scene, read_scene
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.pipeline import reconstruct
+from octasplat.engine.render.environment_files import read_background_map
 from octasplat.engine.runs.config import ReconstructionConfig, resolve_config
 from tests.support.tiny_dataset import make_tiny_dataset
 
@@ -73,6 +74,20 @@ def test_run_begins_with_gaussians_and_exposures_of_a_finished_one(
     np.testing.assert_allclose(exposures(unchanged), exposures(finished), atol=1e-6)
     anew = reconstruct(scene, tmp_path / "anew", make_config(**UNCHANGED))
     assert abs(gaussians(anew).means_world.mean() - before.means_world.mean()) > 1e-4
+
+
+def test_exposures_and_background_are_taken_from_the_files_of_a_run_without_checkpoints(
+    scene: Path, tmp_path: Path
+) -> None:
+    learnt = {"background": "learnt", "background_height": 16}
+    finished = reconstruct(scene, tmp_path / "finished", make_config(**learnt, iterations=60))
+    shutil.rmtree(finished / "checkpoints")
+    config = make_config(**learnt, **UNCHANGED, **{"lr.background": 1e-9})
+    unchanged = reconstruct(scene, tmp_path / "next", config, start_from=finished)
+    np.testing.assert_allclose(exposures(unchanged), exposures(finished), atol=1e-6)
+    before, after = (read_background_map(run / "background.exr") for run in (finished, unchanged))
+    assert np.ptp(before) > 0.01
+    np.testing.assert_allclose(after, before, atol=1e-5)
 
 
 def test_depth_maps_that_are_added_keep_the_exposures(scene: Path, finished: Path, tmp_path: Path) -> None:

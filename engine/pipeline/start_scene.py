@@ -26,7 +26,18 @@ from octasplat.engine.gaussians.merge import about_origin, with_sh_degree
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.poses.find_poses import read_pose_record
 from octasplat.engine.poses.photographs import photographs_of_scene, photographs_sha256
-from octasplat.engine.runs.run_folder import CHECKPOINTS, POSES, SCENE, START, VIEWS, is_run, run_origin
+from octasplat.engine.runs.config import read_config
+from octasplat.engine.runs.finished_shading import finished_shading
+from octasplat.engine.runs.run_folder import (
+    CHECKPOINTS,
+    CONFIG,
+    POSES,
+    SCENE,
+    START,
+    VIEWS,
+    is_run,
+    run_origin,
+)
 from octasplat.engine.train.config import TrainConfig, max_gaussian_count
 from octasplat.engine.train.initialization.initial_gaussians import (
     add_initial_materials,
@@ -203,10 +214,25 @@ def _read_source(source: Path) -> tuple[BestState, Origin]:
     if newest is not None:
         state = load_checkpoint(newest)
         gaussians, shading, corrections = state.gaussians, state.shading, state.pose_corrections
+    else:  # an edited run has none, and those of a finished one may have been deleted
+        shading = _shading_of_results(source)
     if (source / SCENE).exists():
         gaussians = read_scene(source / SCENE)[0]
     assert gaussians is not None
     return BestState(gaussians, shading, corrections), run_origin(source) or NO_ORIGIN
+
+
+def _shading_of_results(source: Path) -> dict[str, np.ndarray]:
+    """Return what the files of a finished run hold of exposures, background and light; empty if they do not."""
+    if not ((source / CONFIG).exists() and (source / VIEWS).exists()):
+        return {}
+    views = read_views(source / VIEWS)
+    options = ShadingOptions.from_config(read_config(source / CONFIG).train)
+    names = [view.name for view in views.views]
+    try:
+        return dict(finished_shading(source, options, views.extent_world, names).state())
+    except ConfigError:  # a file is gone: all is learnt anew
+        return {}
 
 
 def _copy_found_poses(scene: Path, output: Path, source: Path) -> None:
