@@ -78,6 +78,7 @@ def _write_light(source: Path, target: Path, turn: Float64[np.ndarray, "3 3"]) -
     new_up = turn @ up
     content = json.loads((source / CONFIG).read_text(encoding="utf-8"))
     content["scene"] = dataset_folder_of_run(source).name
+    content["reconstruction"]["region"] = None  # a box in the old world, of use to the training alone
     if not _is_identity(turn):
         content["reconstruction"]["train"]["materials"]["up_world"] = new_up.tolist()
     write_json(target / CONFIG, content)

@@ -4,6 +4,7 @@ import json
 import shutil
 
 import numpy as np
+import pycolmap
 import pytest
 
 import octasplat as osp
@@ -83,6 +84,22 @@ def test_transformed_run_keeps_relative_cameras(shiny_run, octasplat, tmp_path):
         refused = octasplat("evaluate", tmp_path / "moved", *more)
         assert refused.exit_code == 1 and "same world" in refused.stderr, refused.output
         assert not (tmp_path / "moved" / "metrics.json").exists()
+
+
+def test_transformed_run_of_a_region_is_measured(run, octasplat, tmp_path):
+    trained = shutil.copytree(run.output, tmp_path / "run", ignore=shutil.ignore_patterns("on", "cache"))
+    content = json.loads((trained / "config.json").read_text())
+    content["reconstruction"]["region"] = [-0.2, -0.2, -0.2, 0.2, 0.2, 0.2]
+    (trained / "config.json").write_text(json.dumps(content))
+    moved, photographs = tmp_path / "moved", shutil.copytree(run.scene, tmp_path / "photographs")
+    assert octasplat("transform", trained, "--translate", 50, 0, 0, "-o", moved).exit_code == 0
+    model = pycolmap.Reconstruction(photographs / "sparse" / "0")
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), [50.0, 0.0, 0.0]))
+    model.write(photographs / "sparse" / "0")
+    done = octasplat("evaluate", moved, "--dataset", photographs, "--threads", 1)
+    assert done.exit_code == 0, done.output
+    psnr = json.loads((moved / "metrics.json").read_text())["mean"]["psnr"]
+    assert psnr == pytest.approx(run.metrics()["mean"]["psnr"], abs=0.02)
 
 
 def test_transformed_run_rotates_environment():
