@@ -199,10 +199,12 @@ def measure_run(
     progress: EventListener,
     into: Path | None = None,
     check: OtherWorldCheck | None = None,
+    is_own: bool = True,
 ) -> None:
     """Measure the scene of ``output``; the results go ``into`` another folder or that one.
 
-    A ``check`` warns of photographs of another world.
+    A ``check`` warns of photographs of another world. Those that are the run's own (``is_own``) are shown at
+    the exposures that it has learnt.
     """
     truth = _find_ground_truth(dataset, progress, needed=into is not None)
     gaussians, _ = read_gaussian_ply(output / SCENE)
@@ -225,7 +227,7 @@ def measure_run(
             output,
             shown_options(config.train, gaussians),
             extent,
-            [view.name for view in dataset.views] if into is None else (),
+            [view.name for view in dataset.views] if is_own else (),
         ),
         background=config.evaluation_background,
         run={
@@ -239,7 +241,7 @@ def measure_run(
             **{key: training[key] for key in TRAINING_KEYS if key in training},
             **_pose_facts(output),
             **_place_facts(output),
-            **({"exposure": ESTIMATED_EXPOSURE_NOTE} if "exposures" in training and into is None else {}),
+            **({"exposure": ESTIMATED_EXPOSURE_NOTE} if "exposures" in training and is_own else {}),
         },
         config=json.loads((output / CONFIG).read_text(encoding="utf-8")),
         threads=threads,
@@ -313,6 +315,7 @@ def _evaluate_on(
             progress=progress,
             into=into,
             check=OtherWorldCheck(on, run_views, _own_psnr(output)),
+            is_own=is_own,
         )
     return into / "metrics.json"
 

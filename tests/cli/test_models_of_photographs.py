@@ -42,11 +42,30 @@ def others(run, tmp_path) -> Path:
 def test_evaluate_all_views_of_run_with_found_poses(posed_run, octasplat):
     done = octasplat("evaluate", posed_run, "--all-views", "--threads", 1)
     assert done.exit_code == 0, done.output
-    metrics = json.loads((posed_run / "on" / "bare" / "metrics.json").read_text())
-    assert len(metrics["views"]) == 8
-    held_out = json.loads((posed_run / "metrics.json").read_text())["views"]
+    assert_all_views_are_measured_alike(posed_run)
+
+
+def test_evaluate_all_views_of_run_with_exposures(posed_run, octasplat):
+    before = json.loads((posed_run / "metrics.json").read_text())["views"]
+    training = json.loads((posed_run / "training.json").read_text())
+    names = [path.name for path in (posed_run.parent / "bare" / "images").iterdir()]
+    training["exposures"] = {name: {"log_gains": [-1.0] * 3, "offsets": [0.0] * 3} for name in names}
+    (posed_run / "training.json").write_text(json.dumps(training))
+    for options in ((), ("--all-views",)):
+        done = octasplat("evaluate", posed_run, *options, "--threads", 1)
+        assert done.exit_code == 0, done.output
+    found = assert_all_views_are_measured_alike(posed_run)
+    assert all(abs(found[name]["psnr"] - measured["psnr"]) > 0.1 for name, measured in before.items())
+
+
+def assert_all_views_are_measured_alike(run: Path) -> dict[str, dict[str, float]]:
+    """Check that all views were measured, those held out as in the run's own metrics; return the views."""
+    metrics = json.loads((run / "on" / "bare" / "metrics.json").read_text())
+    held_out = json.loads((run / "metrics.json").read_text())["views"]
+    assert len(metrics["views"]) == 8 and len(held_out) == 2
     for name, measured in held_out.items():
         assert metrics["views"][name]["psnr"] == pytest.approx(measured["psnr"])
+    return metrics["views"]
 
 
 def test_evaluate_other_photographs_without_model_is_refused(posed_run, others, octasplat):
