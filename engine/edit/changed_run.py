@@ -33,8 +33,10 @@ from octasplat.engine.runs.run_folder import (
 
 EDITS_FILE = "edits.json"
 """What was changed since the training, first to last."""
-_COPIED_FILES = (CONFIG, EVENTS, HELD_OUT, TRAINING, VIEWS, ENVIRONMENT_HDR, ENVIRONMENT_EXR, BACKGROUND)
+_COPIED_FILES = (CONFIG, EVENTS, HELD_OUT, VIEWS, ENVIRONMENT_HDR, ENVIRONMENT_EXR, BACKGROUND)
 """What is as true of the scene after it was changed where it stands."""
+_MEASURED = "training_views"
+"""Of the facts on a training: how well its scene showed the views that it was trained on."""
 
 
 def check_new_run(target: Path) -> None:
@@ -108,6 +110,9 @@ def _copy(source: Path, target: Path) -> None:
     for name in _COPIED_FILES:
         if (source / name).exists():
             shutil.copyfile(source / name, target / name)
+    if (source / TRAINING).exists():
+        facts = json.loads((source / TRAINING).read_text(encoding="utf-8"))
+        write_json(target / TRAINING, {name: fact for name, fact in facts.items() if name != _MEASURED})
     if (source / POSES).is_dir():
         # Not by copytree, which sets access and times as well, as a confined job may not.
         for path in (source / POSES).rglob("*"):

@@ -159,9 +159,14 @@ def test_crop_clean_merge_record_edits_in_run(run, octasplat, tmp_path):
     assert octasplat("crop", run.output, "--where", "x > 0", "-o", first).exit_code == 0
     assert octasplat("clean", first, "--no-floaters", "--min-opacity", 0.05, "-o", second).exit_code == 0
     assert octasplat("merge", second, run.output / "scene.ply", "-o", third).exit_code == 0
-    for name in ("config.json", "views.json", "held_out.json", "training.json"):
+    for name in ("config.json", "views.json", "held_out.json"):
         assert (third / name).read_bytes() == (run.output / name).read_bytes()
     assert not (third / "metrics.json").exists()
+    # how well the trained scene showed its views says nothing of what is left
+    training, kept = (json.loads((path / "training.json").read_text()) for path in (run.output, third))
+    assert kept == {name: fact for name, fact in training.items() if name != "training_views"} != training
+    done = octasplat("evaluate", first, "--threads", 1)
+    assert done.exit_code == 0 and "training views" not in done.output, done.output
     crop, clean, merge = json.loads((third / "edits.json").read_text())
     assert crop["operation"] == "crop" and crop["where"] == "x > 0"
     assert clean["min_opacity"] == 0.05 and clean["floaters"] is False
