@@ -139,6 +139,24 @@ def test_file_of_gaussians_is_a_start(scene: Path, finished: Path, tmp_path: Pat
     np.testing.assert_allclose(gaussians(run).means_world, half.means_world, atol=1e-6)
 
 
+def test_time_budget_counts_all_gaussians_of_the_start(scene: Path, finished: Path, tmp_path: Path) -> None:
+    path, output = tmp_path / "many.ply", tmp_path / "run"
+    first = gaussians(finished)
+    export_scene(first.select(np.resize(np.arange(len(first)), 5000)), path)
+    config = make_config(max_gaussians=10_000, rays_per_batch=8192).model_copy(update={"minutes": 0.1})
+    with pytest.raises(CancelledError):
+        reconstruct(
+            scene,
+            output,
+            config,
+            start_from=path,
+            should_stop=(output / "plan.json").exists,
+            threads=1,
+        )
+    plan = json.loads((output / "plan.json").read_text())
+    assert plan["gaussians"] == 5000 and plan["max_gaussians"] >= 5000  # none is taken away for the time
+
+
 def test_unsuitable_starts_are_refused_and_leave_nothing(scene: Path, finished: Path, tmp_path: Path) -> None:
     output, empty = tmp_path / "run", tmp_path / "empty"
     empty.mkdir()

@@ -276,7 +276,13 @@ def _plan_settings(run: ReconstructionRun, clock: PhaseClock) -> TrainConfig:
         now = clock.seconds()
         left = 60 * settings.minutes - now - (now - began)  # the first Gaussians are made once more
         plan = make_plan(
-            run.dataset, config, first, seconds=left, threads=run.threads, should_stop=run.should_stop
+            run.dataset,
+            config,
+            first,
+            seconds=left,
+            threads=run.threads,
+            keeps_first=has_start(output),
+            should_stop=run.should_stop,
         )
         write_plan(output / PLAN, plan)
     # read back, so that a run that goes on has the very same numbers

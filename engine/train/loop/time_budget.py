@@ -60,7 +60,12 @@ class TimeBudgetPlan(BaseModel):
 
 
 def choose_plan(
-    seconds: float, seconds_an_iteration: float, gaussians: int, max_gaussians: int
+    seconds: float,
+    seconds_an_iteration: float,
+    gaussians: int,
+    max_gaussians: int,
+    *,
+    min_gaussians: int = MIN_GAUSSIANS,
 ) -> TimeBudgetPlan:
     """Return as many Gaussians as there is time to train well, and the iterations that the time allows.
 
@@ -69,13 +74,14 @@ def choose_plan(
         seconds_an_iteration: measured with ``gaussians`` Gaussians.
         gaussians: see there.
         max_gaussians: no more Gaussians than this, as the photographs hold no more down.
+        min_gaussians: no fewer than this, however short the time, but for ``max_gaussians``.
     """
     # An iteration takes seconds_unit * count ** COST_POWER.
     seconds_unit = seconds_an_iteration / gaussians**COST_POWER
     gaussian_count = (  # seconds = unit count^p iterations, with iterations in proportion to count
         (seconds / (seconds_unit * ITERATIONS_PER_GAUSSIAN)) ** (1 / (1 + COST_POWER)) if seconds > 0 else 0.0
     )
-    count = min(max_gaussians, max(MIN_GAUSSIANS, round(gaussian_count)))
+    count = min(max_gaussians, max(min_gaussians, round(gaussian_count)))
     iterations = round(seconds / (seconds_unit * count**COST_POWER))
     return TimeBudgetPlan(
         iterations=min(MAX_PLANNED_ITERATIONS, max(MIN_ITERATIONS, iterations)),
@@ -93,6 +99,7 @@ def make_plan(
     *,
     seconds: float,
     threads: int,
+    keeps_first: bool = False,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> TimeBudgetPlan:
     """Measure the pace and choose.
@@ -103,6 +110,7 @@ def make_plan(
         first: Gaussians to begin from; they stay as they are.
         seconds: that the training may take from now on, this included.
         threads: of the training.
+        keeps_first: the training begins with all of ``first``, not with as many as the plan has room for.
         should_stop: asked between iterations.
 
     Raises:
@@ -114,7 +122,8 @@ def make_plan(
         pace_s *= config.shared_sort_until + RAY_SORT_SLOWDOWN * (1 - config.shared_sort_until)
     left_s = USED_FRACTION * (seconds - (time.perf_counter() - began))
     max_gaussians = max_gaussian_count(config, dataset.train_pixel_count, valid_pixel_fraction(dataset))
-    return choose_plan(left_s, pace_s, len(first), max_gaussians)
+    least = max(MIN_GAUSSIANS, len(first)) if keeps_first else MIN_GAUSSIANS
+    return choose_plan(left_s, pace_s, len(first), max_gaussians, min_gaussians=least)
 
 
 def write_plan(path: Path, plan: TimeBudgetPlan) -> None:
