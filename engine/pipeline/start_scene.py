@@ -223,7 +223,7 @@ def _read_source(source: Path) -> tuple[BestState, Origin]:
 
 
 def _shading_of_results(source: Path) -> dict[str, np.ndarray]:
-    """Return what the files of a finished run hold of exposures, background and light; empty if they do not."""
+    """Return exposures, background and light that the files of a finished run hold; empty if they do not."""
     if not ((source / CONFIG).exists() and (source / VIEWS).exists()):
         return {}
     views = read_views(source / VIEWS)

@@ -299,7 +299,8 @@ def load(source: PathLike, *, drop_invalid: bool = False) -> Scene:
     """Return the scene of a file of any format, or of a run.
 
     With a run comes how it has traced rays, and the light that it has learnt, if it has materials;
-    :func:`octasplat.render` shows them in it. What reading loses, as the thickness of Gaussians that were not flat, is logged.
+    :func:`octasplat.render` shows them in it. What reading loses, as the thickness of Gaussians that were
+    not flat, is logged.
 
     Args:
         source: the file, a run or its folder, or the folder of an unpacked SOG.
