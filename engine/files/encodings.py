@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
+from octasplat.engine.gaussians.flattening import GaussianCloud
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
 
 SQRT_HALF = float(np.sqrt(0.5))
@@ -87,6 +88,16 @@ def half_turn_quats(quats_wxyz: Float32[np.ndarray, "n 4"]) -> Float32[np.ndarra
 def half_turn_points(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
     """Return points rotated by 180 degrees about x."""
     return points * np.array([1, -1, -1], dtype=np.float32)
+
+
+def half_turn_cloud(cloud: GaussianCloud) -> GaussianCloud:
+    """Return what a file holds turned as by :func:`half_turn_gaussians`."""
+    return replace(
+        cloud,
+        means_world=half_turn_points(cloud.means_world),
+        quats_wxyz=half_turn_quats(cloud.quats_wxyz),
+        sh=half_turn_sh(cloud.sh),
+    )
 
 
 def half_turn_gaussians(gaussians: FlatGaussians) -> FlatGaussians:

@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 MIN_CHUNK_SIZE = 256
+POINTS_AT_ONCE = 1 << 16
 
 
 def kd_split(points_world: Float[np.ndarray, "n 3"], max_chunks: int) -> list[Int[np.ndarray, "_"]]:
@@ -35,20 +36,37 @@ def kd_order(points_world: Float[np.ndarray, "n 3"], chunk: int) -> Int[np.ndarr
     their own instead of setting the scale for everything.
     """
     done: list[np.ndarray] = []
-    waiting = [np.arange(len(points_world))]
+    # of 32 bits where these do, as the order is the most that takes memory here
+    kind = np.int32 if len(points_world) <= np.iinfo(np.int32).max else np.int64
+    waiting = [np.arange(len(points_world), dtype=kind)]
     while waiting:
         part = waiting.pop()
         if len(part) <= chunk:
             done.append(np.sort(part))
             continue
-        points = points_world[part]
-        axis = int(np.argmax(points.max(axis=0) - points.min(axis=0)))
-        part = part[np.argsort(points[:, axis], kind="stable")]
-        along = points_world[part, axis].astype(np.float64)
+        axis = _longest_side(points_world, part)
+        along = points_world[part, axis]
+        order = np.argsort(along, kind="stable")
         splits = np.arange(chunk, len(part), chunk)
-        costs = splits * (along[splits - 1] - along[0]) + (len(part) - splits) * (along[-1] - along[splits])
+        # of the sorted points: the first, the last, and those before and after each split
+        first, last, before, after = (
+            along[order[places]].astype(np.float64) for places in (0, -1, splits - 1, splits)
+        )
+        part = part[order]
+        del along, order
+        costs = splits * (before - first) + (len(part) - splits) * (last - after)
         # Of equally good splits, the one nearest to the middle
         middle = np.abs(2 * splits - len(part))
         best = splits[np.lexsort((middle, costs))[0]]
         waiting += [part[best:], part[:best]]  # a stack: the first half is taken next
-    return np.concatenate([*done, np.zeros(0, dtype=np.int64)])
+    return np.concatenate([*done, np.zeros(0, dtype=kind)])
+
+
+def _longest_side(points_world: Float[np.ndarray, "n 3"], part: Int[np.ndarray, " m"]) -> int:
+    """Return the axis along which some points spread farthest."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for start in range(0, len(part), POINTS_AT_ONCE):
+        points = points_world[part[start : start + POINTS_AT_ONCE]]
+        low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
+    # In the points' own precision, in which sides may be alike
+    return int(np.argmax(high.astype(points_world.dtype) - low.astype(points_world.dtype)))
