@@ -2,8 +2,8 @@
 
     python -m benchmarks.export_memory [COUNT ...] [--format NAME ...] [--sh-degree 3] [--folder FOLDER]
 
-Each step runs in a process of its own. Another process reads its anonymous memory (``RssAnon``, which leaves out
-pages of files) every few milliseconds. ``losses`` is what :func:`octasplat.engine.files.dropped_on_export` takes,
+Each step runs in a process of its own. Another process reads its anonymous memory (``RssAnon``, which leaves
+out pages of files) every few milliseconds. ``losses`` is :func:`octasplat.engine.files.dropped_on_export`,
 which every export command asks first.
 """
 
@@ -181,7 +181,9 @@ def main() -> None:
     if given.step is not None:
         work(given.step, given.format[0], given.folder, given.counts[0], given.sh_degree)
         return
-    print(f"scene itself: {scene_bytes(1, given.sh_degree)} B a Gaussian; below what each step takes beyond it")
+    print(
+        f"scene itself: {scene_bytes(1, given.sh_degree)} B a Gaussian; below what each step takes beyond it"
+    )
     has_program = find_converter() is not None
     for name in given.format or [name for name in FILES if has_program or name not in NEEDS_PROGRAM]:
         for count in given.counts:

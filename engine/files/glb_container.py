@@ -343,6 +343,16 @@ def json_bytes(document: dict[str, object]) -> bytes:
     return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
 
 
+def part_paths(path: Path, count: int) -> tuple[Path, ...]:
+    """Return the files of a scene for which one is too small: ``path``, ``<stem>.part2.glb`` and so on."""
+    return (path, *(path.with_name(f"{path.stem}.part{k}{path.suffix}") for k in range(2, count + 1)))
+
+
+def part_extras(part: int, count: int) -> dict[str, object]:
+    """Return what the ``extras`` of a file say of its place among so many, from 1; nothing if it is alone."""
+    return {"octasplat_part": [part, count]} if count > 1 else {}
+
+
 def glb_size(json_room: int, length: int) -> int:
     """Return the size of a file with so many bytes of JSON and of data."""
     return HEADER_BYTES + 2 * CHUNK_HEADER_BYTES + json_room + length

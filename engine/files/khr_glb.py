@@ -6,6 +6,7 @@ readers that evaluate harmonics in world directions are right too. With untransf
 only, so that our own files keep the bits of positions and harmonics.
 """
 
+import itertools
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +32,8 @@ from octasplat.engine.gaussians.scene_metadata import SceneMetadata
 EXTENSION = "KHR_gaussian_splatting"
 COMPRESSION = "KHR_gaussian_splatting_compression_spz_2"
 """Within the former: all attributes are those of an SPZ, in the frame of the primitive."""
+JSON_MARGIN = 1024
+"""By so much at most the JSON of a part is longer than that of the whole, for bounds of more digits."""
 COLOR_SPACE = "srgb_rec709_display"
 
 
@@ -104,23 +107,27 @@ def _file_attributes(sh_degree: int, widths: Mapping[str, int]) -> tuple[_Attrib
 def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple[Path, ...]:
     """Write the Gaussians in their order, block by block.
 
+    A scene for which one file is too small goes into ``path``, ``<stem>.part2.glb`` and so on.
+
     Raises:
-        SceneFileError: nothing to write, values that are not finite, or more than the 4 GiB that a GLB can
-            hold.
-        OSError: the file cannot be written.
+        SceneFileError: nothing to write, or values that are not finite.
+        OSError: a file cannot be written.
     """
     scene = select_for_export(gaussians, path, options)
     check_scales(scene, path)
     layout = _file_attributes(scene.sh_degree, scene.channels.widths)
-    text = glb_container.json_bytes(_gltf_json(scene, layout, options.facts))
-    room = pad_to_four(len(text))
-    length = len(scene) * sum(attribute.item_bytes for attribute in layout)
-    total = glb_container.glb_size(room, length)
-    if total > glb_container.MAX_BYTES:
-        advice = "Leave faint ones out with min_opacity, or export a Gaussian PLY."
-        raise glb_container.too_large_error(path, f"{len(scene)} Gaussians need", total, advice)
-    write_glb(path, room, length, _binary_blocks(scene, layout), lambda: text)
-    return (path,)
+    each = sum(attribute.item_bytes for attribute in layout)
+    room = len(glb_container.json_bytes(_gltf_json(scene, layout, options.facts, (1, 1)))) + JSON_MARGIN
+    most = max(1, (glb_container.MAX_BYTES - glb_container.glb_size(room, 0)) // each)
+    count = -(-len(scene) // most)
+    ends = [number * len(scene) // count for number in range(count + 1)]
+    paths = glb_container.part_paths(path, count)
+    for number, (part_path, rows) in enumerate(zip(paths, itertools.pairwise(ends), strict=True), start=1):
+        part = scene.view(slice(*rows))
+        text = glb_container.json_bytes(_gltf_json(part, layout, options.facts, (number, count)))
+        data = _binary_blocks(part, layout)
+        write_glb(part_path, pad_to_four(len(text)), len(part) * each, data, lambda: text)  # noqa: B023
+    return paths
 
 
 def _binary_blocks(scene: FlatGaussians, layout: tuple[_Attribute, ...]) -> Iterator[bytes]:
@@ -131,7 +138,7 @@ def _binary_blocks(scene: FlatGaussians, layout: tuple[_Attribute, ...]) -> Iter
 
 
 def _gltf_json(
-    scene: FlatGaussians, layout: tuple[_Attribute, ...], facts: SceneMetadata
+    scene: FlatGaussians, layout: tuple[_Attribute, ...], facts: SceneMetadata, part: tuple[int, int]
 ) -> dict[str, object]:
     low, high = scene.means_world.min(axis=0), scene.means_world.max(axis=0)
     views: list[dict[str, object]] = []
@@ -157,7 +164,7 @@ def _gltf_json(
         "mode": glb_container.POINTS,
         "extensions": {EXTENSION: splats_json()},
     }
-    extras = glb_container.channel_extras(scene.channels.widths)
+    extras = glb_container.channel_extras(scene.channels.widths) | glb_container.part_extras(*part)
     return {
         "asset": {"version": "2.0", "generator": "octasplat"} | ({"extras": extras} if extras else {}),
         "extensionsUsed": [EXTENSION],

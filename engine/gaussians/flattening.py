@@ -14,8 +14,7 @@ from octasplat.engine.gaussians.channels import Channels, check_row_count
 from octasplat.engine.gaussians.model import FLAT_SCALE, FlatGaussians
 from octasplat.engine.gaussians.rows import (
     RowIndex,
-    TableT,
-    map_rows,
+    allocate_rows,
     overwrite_rows,
     select_rows,
     view_rows,
@@ -132,17 +131,12 @@ def join_blocks(source: CloudBlocks, path: Path) -> GaussianCloud:
     notes: dict[str, None] = {}  # each once, in order
     for rows, cloud in source.blocks:
         if joined is None:
-            joined = _allocate(cloud, source.count)
+            joined = allocate_rows(cloud, source.count)
         overwrite_rows(joined, rows, cloud)
         notes.update(dict.fromkeys(cloud.notes))
     if joined is None:
         raise SceneFileError(f"{path}: holds no Gaussians.")
     return replace(joined, notes=tuple(notes))
-
-
-def _allocate(table: TableT, count: int) -> TableT:
-    """Return a table with the columns of another and so many rows, not filled yet."""
-    return map_rows(table, lambda array: np.empty((count, *array.shape[1:]), array.dtype))
 
 
 def flatten(
@@ -185,7 +179,7 @@ def flatten(
             cloud = select_rows(cloud, valid)
         block, ratios = _flatten_block(cloud)
         if scene is None:
-            scene = _allocate(block, source.count)
+            scene = allocate_rows(block, source.count)
         scene.put(rows, block)
         kept[rows] = True
         thickness.append(ratios)
