@@ -17,7 +17,7 @@ from octasplat.engine.files.channel_columns import ChannelChoice, select_channel
 from octasplat.engine.files.encodings import (
     MAX_SH_DEGREE,
     dropped_sh_message,
-    half_turn_cloud,
+    half_turn_gaussians,
     sh0_from_rgb,
 )
 from octasplat.engine.files.glb_container import GlbFile
@@ -238,7 +238,7 @@ def _to_world(path: Path, cloud: GaussianCloud, matrix: Float64[np.ndarray, "4 4
     """Return the cloud in the world frame: its node's transform, then the half turn to y down."""
     if not np.array_equal(matrix, np.eye(4)):
         cloud = _apply_node_transform(path, cloud, matrix)
-    return half_turn_cloud(cloud)
+    return half_turn_gaussians(cloud)
 
 
 def _apply_node_transform(

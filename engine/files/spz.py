@@ -14,7 +14,7 @@ from octasplat.engine.files.encodings import (
     SQRT_HALF,
     dropped_sh_message,
     from_smallest_three,
-    half_turn_cloud,
+    half_turn_gaussians,
     half_turn_points,
     half_turn_quats,
     half_turn_sh,
@@ -72,7 +72,7 @@ def read(path: Path) -> GaussianCloud:
 
 def _read_blocks(path: Path, _channels: ChannelChoice = "own") -> CloudBlocks:
     found = decode(open_spz(path))
-    return CloudBlocks(found.count, ((rows, half_turn_cloud(cloud)) for rows, cloud in found.blocks))
+    return CloudBlocks(found.count, ((rows, half_turn_gaussians(cloud)) for rows, cloud in found.blocks))
 
 
 def decode(source: SpzSource) -> CloudBlocks:
