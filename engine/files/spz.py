@@ -54,6 +54,8 @@ LOG_SCALE_STEPS = 16.0
 LOG_SCALE_OFFSET = 10.0
 FRACTIONAL_BITS = 12
 """The least precision of positions where they fit: 1/4096 of a unit."""
+MAX_READ = 10_000_000
+"""Gaussians that Niantic's reader takes, whatever the file says."""
 SMALL_QUANTILE = 0.05
 STEPS_PER_SIGMA = 8.0
 """Positions get as many more bits as it takes to place a small Gaussian this finely."""
@@ -217,7 +219,13 @@ def _find_losses(scene: FlatGaussians) -> tuple[str, ...]:
         return ()  # which is refused
     sizes, harmonics = find_range_losses("spz", scene)
     step = 2.0 ** -_fractional_bits(scene)
-    return (*sizes, *find_position_losses("spz", scene, lambda _rows: step), *harmonics)
+    count: tuple[str, ...] = ()
+    if len(scene) > MAX_READ:
+        count = (
+            f"Niantic's reader, which many viewers use, takes no SPZ of more than {MAX_READ:,} Gaussians; "
+            f"this one has {len(scene):,} (octasplat simplify, or several files by octasplat crop).",
+        )
+    return (*count, *sizes, *find_position_losses("spz", scene, lambda _rows: step), *harmonics)
 
 
 def find_range_losses(format_name: str, scene: FlatGaussians) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -23,6 +23,7 @@ from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.registry import Exporter, register
 from octasplat.engine.files.splat_rows import check_scales, iterate_blocks, select_for_export
 from octasplat.engine.files.usd_stage import ROOT, import_usd, missing_usd, place_in_georeference
+from octasplat.engine.files.usdz_surface import MAX_BYTES
 from octasplat.engine.gaussians.flattening import rotate_axis_to_first
 from octasplat.engine.gaussians.model import FLAT_SCALE, FlatGaussians
 from octasplat.engine.gaussians.scene_metadata import SceneMetadata
@@ -44,7 +45,8 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     """Write ``.usda`` (text), ``.usd`` or ``.usdc`` (binary), or ``.usdz`` (a package).
 
     Raises:
-        SceneFileError: usd-core is missing or too old, nothing to write, or values that are not finite.
+        SceneFileError: usd-core is missing or too old, nothing to write, values that are not finite, or more
+            than the 2 GB that a package can hold.
         OSError: the file cannot be written.
     """
     scene = select_for_export(gaussians, path, options)
@@ -55,6 +57,11 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
         layer = Path(folder) / f"scene{suffix}"
         _write_stage(pxr, scene, layer, options.facts)
         if path.suffix.lower() == ".usdz":
+            if (size := layer.stat().st_size) > MAX_BYTES:
+                raise SceneFileError(
+                    f"{path}: not written; {len(scene):,} Gaussians need {size:,} bytes, and a USDZ of ours "
+                    f"holds at most {MAX_BYTES:,}. Name a .usdc, or leave faint ones out with min_opacity."
+                )
             package = Path(folder) / "scene.usdz"
             if not pxr["UsdUtils"].CreateNewUsdzPackage(pxr["Sdf"].AssetPath(str(layer)), str(package)):
                 raise SceneFileError(f"{path}: not written; usd-core could not make the package.")
