@@ -33,6 +33,7 @@ def read_depth(street: Path, name: str) -> np.ndarray:
     return depth
 
 
+@pytest.mark.exhaustive
 def test_tracks_reproject_and_lie_on_what_is_seen(street: Path) -> None:
     model = pycolmap.Reconstruction(str(street / "sparse" / "0"))
     assert (model.num_reg_images(), model.num_points3D()) == (VIEWS, 600)
@@ -51,6 +52,7 @@ def test_tracks_reproject_and_lie_on_what_is_seen(street: Path) -> None:
     assert np.median(offsets) < 0.03  # the ground is seen at a flat angle
 
 
+@pytest.mark.exhaustive
 def test_every_house_is_photographed_from_several_places(street: Path) -> None:
     model = pycolmap.Reconstruction(str(street / "sparse" / "0"))
     centres = np.array([image.projection_center() for image in model.images.values()])
@@ -76,6 +78,7 @@ def test_houses_do_not_overlap_and_stand_on_the_ground() -> None:
         assert not ((others[:, 0, :2] < high[:2]) & (others[:, 1, :2] > low[:2])).all(axis=1).any()
 
 
+@pytest.mark.exhaustive
 def test_names_sort_in_the_order_of_the_views(tmp_path: Path) -> None:
     config = SyntheticDatasetConfig(
         views=1001, width_px=8, height_px=8, samples_per_side=1, points=5, scene="street"
