@@ -215,7 +215,8 @@ def test_image_header_limits_are_configurable() -> None:
 
 
 def samples() -> list[bytes]:
-    return [make() for _, make in GOOD.values()] + [made for make, _ in BAD.values() if len(made := make()) < 500]
+    damaged = [make() for make, _ in BAD.values()]
+    return [make() for _, make in GOOD.values()] + [data for data in damaged if len(data) < 500]
 
 
 @settings(max_examples=500, deadline=None)
