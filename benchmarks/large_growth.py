@@ -4,8 +4,8 @@
 
 Makes a street for each number of views, longer with more of them, so that every metre is seen alike
 (``scene="street"`` of ``octasplat.engine.dataset.synthetic``, a house on each side for 125 views). Trains it
-with ``--preset fast --threads 1`` in one block for each ``--each`` views, in a process of its own, and prints a
-table of Markdown. What is there already is kept, so that an interrupted benchmark goes on.
+with ``--preset fast --threads 1`` in one block for each ``--each`` views, in a process of its own, and prints
+a table of Markdown. What is there already is kept, so that an interrupted benchmark goes on.
 """
 
 import argparse
@@ -78,9 +78,10 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|", flush=True)
     for views in given.views:
         row = train(given.output, views, given.each)
+        seconds, memory = row["cpu_seconds"], row["memory_bytes"] / 1e9
         print(
-            f"| {views:,} | {row['blocks']} | {row['cpu_seconds']:,.0f} s | {row['cpu_seconds'] / views:.2f} s | "
-            f"{row['memory_bytes'] / 1e9:.2f} GB | {row['gaussians']:,} | {row['psnr']:.2f} dB |",
+            f"| {views:,} | {row['blocks']} | {seconds:,.0f} s | {seconds / views:.2f} s | {memory:.2f} GB | "
+            f"{row['gaussians']:,} | {row['psnr']:.2f} dB |",
             flush=True,
         )
 
