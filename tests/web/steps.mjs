@@ -162,6 +162,40 @@ const steps = {
         return found;
     },
 
+    /** Each folder or file is sent and its job queued; of the first one `cut` parts arrive before the page is left. */
+    async sent() {
+        const found = { puts: [], jobs: [] };
+        const send = async (chosen, cut = Infinity) => {
+            const page = await open(), puts = [];
+            let arrived = 0, begun = 0;
+            page.on("requestfinished", async (request) => { if (request.method() === "PUT" && (await request.response())?.ok()) arrived += 1; });
+            await page.route("**/v1/datasets/**", (route) => {
+                const request = route.request();
+                if (request.method() !== "PUT") return route.continue();
+                if (begun++ >= cut) return route.abort("connectionfailed");
+                puts.push(decodeURIComponent(new URL(request.url()).pathname.split("/").slice(4).join("/")).replace(/[0-9a-f-]{36}/, "ID"));
+                return route.continue();
+            });
+            await page.goto(`${job.url}/new`);
+            await page.setInputFiles(chosen.endsWith(".zip") ? "#pick-files" : "#pick-folder", chosen);
+            await page.waitForFunction(() => document.getElementById("chosen-text").textContent);
+            await page.click("#start");
+            if (cut < Infinity) {
+                await page.waitForFunction(() => /connection is lost/.test(document.getElementById("going-text").textContent));
+                while (arrived < cut) await page.waitForTimeout(50);
+                await shot(page, "large_interrupted");
+            } else {
+                await page.waitForURL("**/jobs/*-*");
+                found.jobs.push(page.url().split("/").pop());
+            }
+            await page.context().close();
+            found.puts.push(puts.sort());
+        };
+        await send(job.chosen[0], job.cut);
+        for (const chosen of job.chosen) await send(chosen);
+        return found;
+    },
+
     /** A job that waits, runs and ends while its page and the list are open; nothing is reloaded by hand. */
     async watch() {
         const page = await open(), list = await open();
