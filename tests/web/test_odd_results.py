@@ -1,4 +1,4 @@
-"""Pages of results that lack a part."""
+"""Pages of results that lack a part, and of views with unusual names."""
 
 import json
 import uuid
@@ -6,6 +6,7 @@ import uuid
 from test_page_parts import make_job
 
 from octasplat.service.state import Service
+from octasplat.workers.worker.job_kinds import get_job_kind
 from tests.support.service_harness import ConnectService, store_content
 
 
@@ -33,3 +34,18 @@ async def test_page_of_measured_views_without_renders_is_shown(
         page = await http.get(f"/jobs/{job_id}")
     assert page.status_code == 200 and 'data-sort="a.jpg"' in page.text
     assert 'id="view-shown"' not in page.text
+
+
+async def test_choices_of_views_keep_names_with_spaces(
+    connect_service: ConnectService, database: str
+) -> None:
+    # Browsers take the text of a choice without a value, with its spaces drawn together.
+    kind = get_job_kind("relight")
+    results = dict.fromkeys((*kind.source_files, "renders/two  spaces.png"), b"{}")
+    results["held_out.json"] = json.dumps(["two  spaces.jpg"]).encode()
+    async with connect_service() as (http, service):
+        jobs = [await finished_job(service, database, results) for _ in range(2)]
+        job = await http.get(f"/jobs/{jobs[0]}")
+        compared = await http.get("/compare", params={"job": [str(job_id) for job_id in jobs]})
+    assert '<option value="two  spaces.jpg">' in job.text
+    assert '<option value="two  spaces.png" selected>' in compared.text
