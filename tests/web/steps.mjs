@@ -796,6 +796,21 @@ const steps = {
         found.polled = true;
         return found;
     },
+
+    /** The log of a job, one request of which the service could not answer. */
+    async log() {
+        const page = await open();
+        const asked = [];
+        await page.route("**/logs?*", (route) => {
+            asked.push(new URL(route.request().url()).searchParams.get("after"));
+            if (asked.length > 1) return route.continue();
+            return route.fulfill({ status: 503, contentType: "application/problem+json", body: '{"title": "busy"}' });
+        });
+        await page.goto(`${job.url}/jobs/${job.job}`);
+        if (!await page.evaluate(() => document.getElementById("log-fold").open)) await page.click("#log-fold summary");
+        await page.waitForFunction(() => document.getElementById("log").textContent.includes("a line"), undefined, { timeout: 30000 });
+        return { asked };
+    },
 };
 
 try {

@@ -142,6 +142,7 @@ async function followLog() {
         if (fold.open && !document.hidden) {
             try {
                 const response = await fetch(`${api}/logs?after=${after}&limit=2000`);
+                if (!response.ok) throw new Error(String(response.status));
                 const page = await response.json();
                 after = page.next;
                 const atEnd = log.scrollTop + log.clientHeight >= log.scrollHeight - 30;
