@@ -809,7 +809,11 @@ const steps = {
         await page.goto(`${job.url}/jobs/${job.job}`);
         if (!await page.evaluate(() => document.getElementById("log-fold").open)) await page.click("#log-fold summary");
         await page.waitForFunction(() => document.getElementById("log").textContent.includes("a line"), undefined, { timeout: 30000 });
-        return { asked };
+        // Folded and opened again, it goes on where it was.
+        await page.click("#log-fold summary");
+        await page.click("#log-fold summary");
+        await page.waitForTimeout(3000);
+        return { asked, lines: await page.evaluate(() => document.getElementById("log").textContent.split("a line").length - 1) };
     },
 };
 

@@ -25,8 +25,9 @@ async def _job_with_log(database: str) -> str:
     return str(job_id)
 
 
-def test_log_goes_on_after_a_request_that_was_not_answered(
+def test_log_goes_on_after_a_refused_request_and_after_folding(
     service: RunningService, browse: Browse, database: str
 ) -> None:
     found = browse("log", service.url, job=asyncio.run(_job_with_log(database)), seconds=90)
     assert found["asked"][:2] == ["0", "0"]
+    assert found["lines"] == 1

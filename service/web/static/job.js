@@ -161,8 +161,9 @@ document.addEventListener("job-changed", ({ detail }) => {
     // A retried job has a life ahead of it again.
     if (isOver(about.dataset.state) !== isOver(detail.state)) location.reload();
 });
-document.getElementById("log-fold").addEventListener("toggle", followLog, { once: true });
-if (document.getElementById("log-fold").open) followLog();
+const logFold = document.getElementById("log-fold");
+if (logFold.open) followLog();
+else logFold.addEventListener("toggle", followLog, { once: true });
 readPast().catch(() => {}).then(() => {
     charts?.update();
     if (!isOver(about.dataset.state)) listen();
