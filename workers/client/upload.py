@@ -190,7 +190,7 @@ def _find_or_create_dataset(
         # In the place of the contents, which would all have to be read first.
         facts = file.path.stat()
         digest.update(f"{file.name}\0{facts.st_size}\0{facts.st_mtime_ns}\0{facts.st_ino}\n".encode())
-    body = {"name": name, "holds": holds} if holds == "files" else {"name": name}
+    body = {"name": name[:200]} | ({"holds": holds} if holds == "files" else {})
     return create_dataset_once(api, body, f"scene-{digest.hexdigest()}")
 
 
