@@ -1,6 +1,7 @@
 """Folders and ZIP files with unusual names, which become the names of datasets."""
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -47,3 +48,12 @@ def test_scene_whose_name_is_longer_than_that_of_a_dataset_is_sent(
     with Api(serve(service).address) as api:
         upload_scene(api, folder)
     assert service.made[0]["name"] == "n" * MAX_NAME
+
+
+def test_zip_file_whose_name_is_no_utf_8_is_sent(serve: Callable[..., Front], tmp_path: Path) -> None:
+    archive = Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9.zip"))
+    archive.write_bytes(b"x")
+    service = Scenes()
+    with Api(serve(service).address) as api:
+        upload_scene(api, archive)
+    assert service.made[0]["name"] == "caf\N{REPLACEMENT CHARACTER}"

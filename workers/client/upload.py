@@ -140,11 +140,11 @@ def upload_scene(
     """
     is_archive = scene.is_file()
     if is_archive:
-        files = [LocalFile(scene.name, scene, scene.stat().st_size)]
+        files = [LocalFile(_replace_non_utf8(scene.name), scene, scene.stat().st_size)]
         _preview_archive(api, scene, on_warning)
     else:
         files = list_scene_files(api, scene, on_warning)
-    dataset = _find_or_create_dataset(api, name or scene.resolve().stem, files)
+    dataset = _find_or_create_dataset(api, name or _replace_non_utf8(scene.resolve().stem), files)
     if is_archive and dataset["state"] == "open":
         _send_archive(api, dataset["id"], files[0], progress)
     else:
