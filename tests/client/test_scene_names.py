@@ -2,11 +2,15 @@
 
 import json
 import os
+import uuid
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from octasplat.workers.client.api import Api
+from octasplat.workers.client.submission import Submission, submit
 from octasplat.workers.client.upload import upload_scene
 from tests.support.scripted_front import Answer, Front, as_json, serve
 
@@ -57,3 +61,20 @@ def test_zip_file_whose_name_is_no_utf_8_is_sent(serve: Callable[..., Front], tm
     with Api(serve(service).address) as api:
         upload_scene(api, archive)
     assert service.made[0]["name"] == "caf\N{REPLACEMENT CHARACTER}"
+
+
+def test_folder_that_is_named_by_a_digest_is_sent(
+    serve: Callable[..., Front], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not taken for the id of a dataset, which is written with dashes."""
+    name = "0123456789abcdef" * 2
+    (tmp_path / name).mkdir()
+    (tmp_path / name / "a.jpg").write_bytes(b"x")
+    monkeypatch.chdir(tmp_path)
+    service = Scenes()
+    with Api(serve(service).address) as api:
+        submit(api, Submission(Path(name)))
+        assert [made.get("name") for made in service.made] == [name, None]
+        whole = str(uuid.UUID(name))
+        submit(api, Submission(whole))
+    assert [made.get("dataset_id") for made in service.made] == [None, "d", whole]
