@@ -797,6 +797,17 @@ const steps = {
         return found;
     },
 
+    /** Notes in a 3D view, some of which were written after the page was loaded. */
+    async notes() {
+        const page = await open();
+        await page.goto(`${job.url}/jobs/${job.job}`);
+        await page.waitForSelector("#viewer .view-notes li");
+        await page.evaluate(({ address, notes }) => fetch(address, { method: "PATCH", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ view_notes: notes }) }), { address: `/v1/jobs/${job.job}`, notes: job.notes });
+        await page.click("#viewer .view-notes li:first-child [aria-label^=Remove]");
+        await page.waitForFunction((text) => !document.querySelector("#viewer .view-notes").textContent.includes(text), job.notes[0].text);
+        return { shown: await page.locator("#viewer .view-notes li button:first-child").allTextContents() };
+    },
+
     /** The log of a job, one request of which the service could not answer. */
     async log() {
         const page = await open();
