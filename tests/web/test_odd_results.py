@@ -49,3 +49,18 @@ async def test_choices_of_views_keep_names_with_spaces(
         compared = await http.get("/compare", params={"job": [str(job_id) for job_id in jobs]})
     assert '<option value="two  spaces.jpg">' in job.text
     assert '<option value="two  spaces.png" selected>' in compared.text
+
+
+async def test_pages_go_on_beside_a_newer_version_with_more_columns(
+    connect_service: ConnectService, database: str
+) -> None:
+    async with connect_service() as (http, service):
+        job_id = await finished_job(service, database, {"metrics.json": b"{}", "renders/a.png": b""})
+        async with service.pool.connection() as connection:
+            await connection.execute("ALTER TABLE artifacts ADD COLUMN of_the_next_version integer")
+        try:
+            for path in ("/", f"/jobs/{job_id}"):
+                assert (await http.get(path)).status_code == 200, path
+        finally:
+            async with service.pool.connection() as connection:
+                await connection.execute("ALTER TABLE artifacts DROP COLUMN of_the_next_version")
