@@ -796,6 +796,36 @@ const steps = {
         found.polled = true;
         return found;
     },
+
+    /** Notes in a 3D view, some of which were written after the page was loaded. */
+    async notes() {
+        const page = await open();
+        await page.goto(`${job.url}/jobs/${job.job}`);
+        await page.waitForSelector("#viewer .view-notes li");
+        await page.evaluate(({ address, notes }) => fetch(address, { method: "PATCH", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ view_notes: notes }) }), { address: `/v1/jobs/${job.job}`, notes: job.notes });
+        await page.click("#viewer .view-notes li:first-child [aria-label^=Remove]");
+        await page.waitForFunction((text) => !document.querySelector("#viewer .view-notes").textContent.includes(text), job.notes[0].text);
+        return { shown: await page.locator("#viewer .view-notes li button:first-child").allTextContents() };
+    },
+
+    /** The log of a job, one request of which the service could not answer. */
+    async log() {
+        const page = await open();
+        const asked = [];
+        await page.route("**/logs?*", (route) => {
+            asked.push(new URL(route.request().url()).searchParams.get("after"));
+            if (asked.length > 1) return route.continue();
+            return route.fulfill({ status: 503, contentType: "application/problem+json", body: '{"title": "busy"}' });
+        });
+        await page.goto(`${job.url}/jobs/${job.job}`);
+        if (!await page.evaluate(() => document.getElementById("log-fold").open)) await page.click("#log-fold summary");
+        await page.waitForFunction(() => document.getElementById("log").textContent.includes("a line"), undefined, { timeout: 30000 });
+        // Folded and opened again, it goes on where it was.
+        await page.click("#log-fold summary");
+        await page.click("#log-fold summary");
+        await page.waitForTimeout(3000);
+        return { asked, lines: await page.evaluate(() => document.getElementById("log").textContent.split("a line").length - 1) };
+    },
 };
 
 try {

@@ -1,5 +1,6 @@
 // Sends a scene file by file, each with its digest; what has arrived before is not sent again.
 
+import { shortName } from "./file_names.js";
 import { LARGE_BYTES, base64, hex, sendInParts } from "./large_file.js";
 import { answer } from "./options.js";
 
@@ -73,7 +74,7 @@ export class Upload {
         const make = (key) => fetch("/v1/datasets", {
             method: "POST",
             headers: { "Content-Type": "application/json", "Idempotency-Key": key },
-            body: JSON.stringify({ name: this.title, holds: this.holds }),
+            body: JSON.stringify({ name: shortName(this.title), holds: this.holds }),
         }).then(answer);
         try {
             return await this.again(() => make(key));
