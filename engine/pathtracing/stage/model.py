@@ -333,7 +333,8 @@ class Stage(StageModel):
             if light.only_shadows:
                 raise ValueError(
                     f"the shadows of lights[{number}] (only_shadows) fall on Gaussians with light = "
-                    '"shadowed" alone, and this stage has none; give [[gaussians]] this light, or leave the lamp out'
+                    '"shadowed" alone, and this stage has none; give [[gaussians]] this light, or leave the '
+                    "lamp out"
                 )
         return lights
 
