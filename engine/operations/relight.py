@@ -165,6 +165,7 @@ def run(
     from octasplat.engine.render.shots import camera_shots
     from octasplat.engine.runs.config import read_config
     from octasplat.engine.runs.run_folder import CONFIG, SCENE, is_run
+    from octasplat.engine.shading.recipes import material_shading
 
     report = stop_when_asked(progress, should_stop)
     for sentence in request.unused():
@@ -176,6 +177,13 @@ def run(
     source = read_render_source(request.source, report, dataset=request.dataset, max_side=request.max_side)
     require_materials(source.gaussians, request.source / SCENE if of_run else request.source)
     learnt = read_config(request.source / CONFIG).train.materials if of_run else None
+    if learnt is not None and material_shading(learnt.recipe).albedo_holds_light:
+        report(
+            Warned(
+                f"{request.source} was trained with materials.recipe={learnt.recipe}: base colors of what "
+                "does not reflect hold the light of the photographs."
+            )
+        )
     up = light_up(request.source, request.up)
     cameras = None if request.other_dataset is not None else requested_cameras(request, source)
     views, shots = _selected_views(request, source) if cameras is None else (None, camera_shots(cameras))
