@@ -70,7 +70,7 @@ def hit_walls(
 ) -> Float64[np.ndarray, "n 3"]:
     """Return the points of the room's inside that rays from within it meet."""
     with np.errstate(divide="ignore"):
-        ends = np.where(directions > 0, HIGH - origins, LOW - origins) / directions
+        ends = np.abs(np.where(directions > 0, HIGH - origins, LOW - origins) / directions)
     return origins + ends.min(axis=1, keepdims=True) * directions
 
 
@@ -171,7 +171,8 @@ def compare(pictures: Path, room: Path) -> dict[str, float]:
         ball = read_image(room / "ground_truth/masks" / path.name)[..., 0] > 0.5
         for name, part in (("ball", error[ball]), ("room", error[~ball]), ("all", error.reshape(-1, 3))):
             squares[name].append(part)
-    return {name: -10 * float(np.log10(np.concatenate(parts).mean())) for name, parts in squares.items()}
+    means = {name: float(np.concatenate(parts).mean()) for name, parts in squares.items()}
+    return {name: -10 * float(np.log10(mean)) if mean > 0 else np.inf for name, mean in means.items()}
 
 
 def main() -> None:

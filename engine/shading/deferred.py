@@ -250,7 +250,7 @@ class DeferredShading:
         grad_alpha, grad_normal = split.expand(grad_alpha), split.expand(grad_normal)
         grad_features, grad_depth = split.expand(grad_features), split.expand(grad_depth)
         # --- the split sum at the shaded points ---
-        grad_display = split.expand(grad_rgb)[gbuffer.ray_ids] * ctx.share[:, None]
+        grad_display = split.expand(grad_rgb)[gbuffer.ray_ids] * ctx.share[:, None].astype(np.float32)
         grad_alpha[gbuffer.ray_ids] += (grad_display * ctx.display).sum(axis=1)  # rgb = share alpha display
         grad_linear = self._display_backward(ctx.linear, grad_display * gbuffer.alpha[:, None])
         blur = settings.blur_roughness(traced.training_progress)

@@ -42,6 +42,8 @@ MIN_REFLECTING_SHARE = 0.04
 """Share of a mirror up to which a surface sends no reflected rays."""
 ALBEDO_WEIGHT = 0.05
 """Weight of half the squared difference of what is matt from its base color, in the loss."""
+MATT_POWER = 8
+"""Power of the matt share in that weight: mirrors, and what becomes one, learn from reflections."""
 PROBED_FRACTION = 0.05
 """Of the points below that share, so many send some in a training: they may turn out to reflect."""
 
@@ -210,13 +212,10 @@ class NearFieldShading(DeferredShading):
         # so that files and relighting have a base color of what is matt: that which it shows
         material = ctx.gbuffer.surface.material
         shown = srgb_to_linear(np.clip(split.results.rgb_srgb[ids] / ctx.gbuffer.alpha[:, None], 0.0, 1.0))
-        grad_material[:, :METALLIC_COLUMN] += (
-            (1 - ctx.share)[:, None]
-            * (material[:, :METALLIC_COLUMN] - shown)
-            * (ALBEDO_WEIGHT / len(grad_rgb))
-        )
-        weight = self.settings.harmonics_weight * 2 / (3 * len(grad_rgb))
-        missing = split.expand(weight * (traced.result.rgb_srgb - shaded.rgb_srgb))[ids]
+        weight = ALBEDO_WEIGHT / len(grad_rgb) * (1 - ctx.share) ** MATT_POWER
+        grad_material[:, :METALLIC_COLUMN] += weight[:, None] * (material[:, :METALLIC_COLUMN] - shown)
+        harmonics_weight = self.settings.harmonics_weight * 2 / (3 * len(grad_rgb))
+        missing = split.expand(harmonics_weight * (traced.result.rgb_srgb - shaded.rgb_srgb))[ids]
         share = ctx.share[:, None]
         grad_harmonics = grad_harmonics.copy()
         grad_harmonics[ids] = (1 - share) * grad_harmonics[ids] + share * missing

@@ -1,10 +1,14 @@
 """Mirrors among what they reflect: what reflected rays see of it, what stays on harmonics, and gradients."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from benchmarks import mirror_room
 from octasplat.engine.core.color import linear_to_srgb, srgb_to_linear
 from octasplat.engine.core.rays import RayBatch
+from octasplat.engine.dataset import Dataset
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians, concatenate
 from octasplat.engine.shading import near_field
 from octasplat.engine.shading.deferred import DeferredShading
@@ -142,3 +146,15 @@ def test_near_field_gradients_agree_with_finite_differences(monkeypatch: pytest.
         parameter[:] = before
         expected = float((gradient * direction).sum())
         assert (values[0] - values[1]) / 0.04 == pytest.approx(expected, rel=0.03), name
+
+
+def test_generated_room_is_a_dataset_whose_ball_mirrors_its_walls(tmp_path: Path) -> None:
+    mirror_room.write_room(tmp_path / "room", views=4, side=24, points=300)
+    dataset = Dataset.open(tmp_path / "room", tmp_path / "cache", threads=1)
+    assert len(dataset.views) == 4
+    # straight at the ball it shows the wall behind the camera
+    eye, ahead = np.array([[1.7, -0.1, 1.1]]), np.array([[-1.0, 0.0, 0.0]])
+    wall_behind = mirror_room.wall_colors(np.array([[2.0, -0.1, 1.1]]))
+    np.testing.assert_allclose(mirror_room.radiance(eye, ahead), mirror_room.TINT * wall_behind, rtol=1e-6)
+    np.testing.assert_allclose(mirror_room.radiance(eye, -ahead), wall_behind, rtol=1e-6)
+    assert mirror_room.compare(tmp_path / "room" / "images", tmp_path / "room")["ball"] == np.inf
