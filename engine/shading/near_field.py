@@ -4,8 +4,10 @@ The split sum lights everything by an environment that is infinitely far, which 
 Here only what reflects is shaded. Of a surface the share ``metallic`` is a mirror of its albedo and
 roughness, the rest shows its harmonics as without materials; reflected rays see the harmonics, in their
 direction, of what they meet, and the environment past everything. So matt surfaces need no light, and are
-mirrored with the colors that photographs show of them. After "EnvGS" (https://arxiv.org/abs/2412.15215), in
-which the surroundings are Gaussians of their own.
+mirrored with the colors that photographs show of them.
+
+After "EnvGS: Modeling View-Dependent Appearance with Environment Gaussian" (https://arxiv.org/abs/2412.15215),
+where the surroundings are Gaussians of their own.
 """
 
 from dataclasses import dataclass, replace
