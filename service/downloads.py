@@ -88,6 +88,28 @@ async def send_blob(
     )
 
 
+def send_bytes(request: Request, content: bytes, *, media_type: str, name: str) -> Response:
+    """Return a response with a small content that is not in the store, always complete.
+
+    Args:
+        request: the request, whose condition is heard.
+        content: all of it.
+        media_type: what it is.
+        name: file name for whoever saves it.
+    """
+    sha256 = hashlib.sha256(content).hexdigest()
+    etag = f'"{sha256}"'
+    headers = {
+        "ETag": etag,
+        "Repr-Digest": format_digest(sha256),
+        "Cache-Control": "private, no-cache",
+        "Content-Disposition": _content_disposition(name, media_type in _INLINE_TYPES),
+    }
+    if etag_matches(request.headers.get("if-none-match"), etag):
+        return Response(status_code=304, headers=headers)
+    return Response(content, headers=headers, media_type=media_type)
+
+
 def send_archive(
     service: Service, artifacts: Sequence[Artifact], name: str, modified_at: datetime
 ) -> Response:

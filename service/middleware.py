@@ -143,7 +143,8 @@ class SecurityHeadersMiddleware(HttpMiddleware):
 
 
 _STORED_CONTENT = re.compile(
-    r"/v1/(jobs|datasets)/[^/]+/((artifacts|files)/.+|preview|archive|events)", re.DOTALL
+    r"/v1/(jobs|datasets)/[^/]+/((artifacts|files)/.+|preview|live-scene|archive|events)|/jobs/[^/]+/report",
+    re.DOTALL,
 )
 _PLAIN_TEXT_HEADER = (b"content-type", b"text/plain; charset=utf-8")
 _SECURITY_HEADERS = (

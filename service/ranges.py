@@ -14,7 +14,8 @@ _SPECIFIER = re.compile(r"([0-9]{1,18})-([0-9]{0,18})|-([0-9]{1,18})")
 def requested_ranges(request: Request, etag: str, size_bytes: int) -> list[tuple[int, int]] | None:
     """Return the ranges that a request asks for, as (start, stop); None asks for the whole content.
 
-    Units other than bytes are ignored, and so are all ranges where ``If-Range`` names another content.
+    Units other than bytes are ignored, and so are all ranges where ``If-Range`` names another content, and
+    those of a request for headers alone (RFC 9110, section 14.2).
     Specifiers that begin behind the end are left out as long as others do not.
 
     Args:
@@ -26,7 +27,7 @@ def requested_ranges(request: Request, etag: str, size_bytes: int) -> list[tuple
         ProblemError: 400 for ranges that cannot be read, 416 if all of them begin behind the end.
     """
     header, condition = request.headers.get("range"), request.headers.get("if-range")
-    if header is None or (condition is not None and condition.strip() != etag):
+    if request.method != "GET" or header is None or (condition is not None and condition.strip() != etag):
         return None
     unit, equals, text = header.partition("=")
     if unit.strip().lower() != "bytes":

@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Self, TypeVar
-from urllib.parse import urlsplit
 
 from pydantic import AliasChoices, BeforeValidator, Field, InstanceOf, SecretStr, ValidationError
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict, SettingsError
@@ -14,6 +13,7 @@ from octasplat.engine.core.errors import ConfigError
 from octasplat.workers.data_folder import default_data_folder
 from octasplat.workers.postgres.embedded import EmbeddedPostgres
 from octasplat.workers.sandbox.job_users import parse_uids
+from octasplat.workers.storage.factory import store_folder
 
 PREFIX = "OCTASPLAT_"
 
@@ -145,9 +145,8 @@ class WorkerSettings(BaseSettings):
     @property
     def own_folders(self) -> tuple[Path, ...]:
         """Return the folders that only the service may open: its data, its storage and its work."""
-        address = urlsplit(self.storage_address)
-        store = (Path(address.path).absolute(),) if address.scheme in ("", "file") else ()
-        return (self.data.absolute(), self.work_folder, *store)
+        store = store_folder(self.storage_address)
+        return (self.data.absolute(), self.work_folder, *(() if store is None else (store,)))
 
     @property
     def retention(self) -> Retention:

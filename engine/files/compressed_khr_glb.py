@@ -4,6 +4,7 @@ The accessors say what comes out of the SPZ and have no data of their own. As th
 opacities are in ``COLOR_0``, and there is no harmonic of degree 0.
 """
 
+import io
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from octasplat.engine.files.encodings import half_turn_points
 from octasplat.engine.files.glb_container import FLOAT, UNSIGNED_BYTE, pad_to_four, write_glb
 from octasplat.engine.files.khr_glb import COMPRESSION, EXTENSION, splats_json
 from octasplat.engine.files.spz import encode
-from octasplat.engine.files.spz_container import pack_spz
+from octasplat.engine.files.spz_container import write_spz
 from octasplat.engine.gaussians.model import FlatGaussians
 
 EXTENSIONS = (EXTENSION, COMPRESSION)
@@ -38,7 +39,9 @@ def write_compressed_glb(scene: FlatGaussians, path: Path, centre_world: Float64
     """
     means = (scene.means_world.astype(np.float64) - centre_world).astype(np.float32)
     about = replace(scene, means_world=means)
-    data = pack_spz(encode(about, path, SPZ_VERSION))
+    packed = io.BytesIO()
+    write_spz(encode(about, path, SPZ_VERSION), packed)
+    data = packed.getvalue()
     text = glb_container.json_bytes(_gltf_json(about, centre_world, len(data)))
     length = pad_to_four(len(data))
     write_glb(path, pad_to_four(len(text)), length, [data.ljust(length, b"\0")], lambda: text)

@@ -4,6 +4,7 @@ Element ``chunk`` holds the bounds of positions, ln scales and (in newer files) 
 has four uint32 a Gaussian; an optional element ``sh`` has a byte a higher coefficient, channel-major.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,10 @@ from jaxtyping import Float32, Int, UInt32
 
 from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.core.ply_container import PlyHeader, columns, read_ply, read_ply_header
+from octasplat.engine.files.channel_columns import ChannelChoice
 from octasplat.engine.files.encodings import SQRT_HALF, from_smallest_three, logits_from_bytes, sh0_from_rgb
 from octasplat.engine.files.registry import Importer, register
-from octasplat.engine.gaussians.flattening import GaussianCloud
+from octasplat.engine.gaussians.flattening import CloudBlocks, GaussianCloud, join_blocks, row_slices
 
 PATTERNS = ("*.compressed.ply",)
 CHUNK_SIZE = 256
@@ -29,10 +31,26 @@ def read(path: Path) -> GaussianCloud:
     Raises:
         SceneFileError: the file is no compressed PLY, is truncated, or its chunks do not fit its Gaussians.
     """
+    return join_blocks(_read_blocks(path), path)
+
+
+def _read_blocks(path: Path, _channels: ChannelChoice = "own") -> CloudBlocks:
     header = read_ply_header(path)
     _check_elements(path, header)
     names = ["chunk", "vertex", *(["sh"] if header.element("sh") is not None else [])]
     _, tables = read_ply(path, names)
+    count = len(tables["vertex"])
+
+    def block(rows: slice) -> GaussianCloud:
+        # A block begins with a chunk.
+        chunks = slice(rows.start // CHUNK_SIZE, -(-rows.stop // CHUNK_SIZE))
+        own = {name: table[chunks if name == "chunk" else rows] for name, table in tables.items()}
+        return _decode(own)
+
+    return CloudBlocks(count, ((rows, block(rows)) for rows in row_slices(count)))
+
+
+def _decode(tables: Mapping[str, np.ndarray]) -> GaussianCloud:
     packed = {
         name: np.ascontiguousarray(tables["vertex"][name]).astype(np.uint32) for name in _PACKED_PROPERTIES
     }
@@ -127,5 +145,6 @@ register(
         "compressed PLY of PlayCanvas and SuperSplat",
         read,
         _recognises,
+        read_blocks=_read_blocks,
     )
 )

@@ -1,12 +1,15 @@
 """Encodings of colors, opacities, rotations and axes in splat formats, shared by readers and writers."""
 
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
+from octasplat.engine.gaussians.flattening import GaussianCloud
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
 
+SceneT = TypeVar("SceneT", FlatGaussians, GaussianCloud)
 SQRT_HALF = float(np.sqrt(0.5))
 MAX_SH_DEGREE = 3
 """The highest degree of spherical harmonics that scenes have."""
@@ -89,8 +92,8 @@ def half_turn_points(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, 
     return points * np.array([1, -1, -1], dtype=np.float32)
 
 
-def half_turn_gaussians(gaussians: FlatGaussians) -> FlatGaussians:
-    """Return the scene turned by 180 degrees about x: from y down, z forward to y up, z backward, and back.
+def half_turn_gaussians(gaussians: SceneT) -> SceneT:
+    """Return Gaussians turned by 180 degrees about x: from y down, z forward to y up, z backward, and back.
 
     Only signs change, so doing it twice gives the same bits.
     """

@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float32
 
 from octasplat.engine.core.errors import ConfigError, SceneFileError
 from octasplat.engine.core.ply_container import (
@@ -39,19 +38,28 @@ from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.octagon_recovery import is_octagon_ply
 from octasplat.engine.files.place_comments import parse_place, place_comments
 from octasplat.engine.files.ply_dialects import (
+    MIP_FILTER,
     UNUSED_SCALE_MESSAGE,
     has_unused_third_scale,
     ignored_properties_message,
     refuse_anchors,
+    with_mip_filter,
 )
 from octasplat.engine.files.registry import Exporter, Importer, register
 from octasplat.engine.files.splat_rows import select_for_export
 from octasplat.engine.gaussians.channels import Channels, column_names, stack_channels
-from octasplat.engine.gaussians.flattening import FLAT_LOG_SCALE, GaussianCloud, ImportReport, flatten
+from octasplat.engine.gaussians.flattening import (
+    FLAT_LOG_SCALE,
+    CloudBlocks,
+    GaussianCloud,
+    ImportReport,
+    flatten,
+    join_blocks,
+    row_slices,
+)
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.scene_metadata import UNKNOWN_METADATA, SceneMetadata
 
-ROWS_PER_BLOCK = 65536
 PlyDialect = Literal["3dgs", "2dgs", "games"]
 """What the scales of a PLY mean.
 
@@ -59,9 +67,6 @@ PlyDialect = Literal["3dgs", "2dgs", "games"]
 Gaussian Splatting, and gsplat's, whose third scale means nothing): the first two lie in the plane, the normal
 is axis 2. ``games`` (GaMeS, REdiSplats): the last two lie in the plane, the normal is axis 0.
 """
-_FILTER = "filter_3D"
-"""Standard deviation (world units) of the smoothing that Mip-Splatting and Gaussian Opacity Fields apply to
-each Gaussian before they show it."""
 _NUMBERS = ("near_world", "pixel_rad", "turned_beyond")
 """Those of :class:`SceneMetadata` that a comment of the same name gives."""
 _POSITION = ("x", "y", "z")
@@ -138,8 +143,7 @@ def metadata_comments(facts: SceneMetadata) -> list[str]:
 def _row_blocks(gaussians: FlatGaussians, degree: int, dtype: np.dtype[np.void]) -> Iterator[np.ndarray]:
     rest_own = gaussians.sh.shape[1] - 1
     rest_file = (degree + 1) ** 2 - 1
-    for start in range(0, len(gaussians), ROWS_PER_BLOCK):
-        part = slice(start, start + ROWS_PER_BLOCK)
+    for part in row_slices(len(gaussians)):
         n = len(gaussians.means_world[part])
         values = np.zeros((n, len(dtype.names or ())), dtype="<f4")  # normals stay 0
         values[:, 0:3] = gaussians.means_world[part]
@@ -179,7 +183,7 @@ def read_gaussian_ply(
         SceneFileError: the file is not a PLY, is truncated, holds compressed or no Gaussians, lacks a
             property, or holds values that are not finite.
     """
-    return flatten(read_ply_cloud(path, channels, dialect), path, drop_invalid=drop_invalid)
+    return flatten(read_ply_blocks(path, channels, dialect), path, drop_invalid=drop_invalid)
 
 
 def read_ply_cloud(
@@ -196,6 +200,17 @@ def read_ply_cloud(
         SceneFileError: the file is not a PLY, is truncated, holds compressed or no Gaussians, or lacks a
             property.
     """
+    return join_blocks(read_ply_blocks(path, channels, dialect), path)
+
+
+def read_ply_blocks(path: Path, channels: ChannelChoice = "own", dialect: PlyDialect = "3dgs") -> CloudBlocks:
+    """Return what :func:`read_ply_cloud` does, some thousands at a time.
+
+    A binary file is mapped; the rows of a text file are in memory.
+
+    Raises:
+        SceneFileError: likewise.
+    """
     header = read_ply_header(path)
     vertex = header.element("vertex")
     if header.element("chunk") is not None or (vertex is not None and "packed_position" in vertex.names):
@@ -208,37 +223,49 @@ def read_ply_cloud(
     if vertex.count == 0:
         raise SceneFileError(f"{path}: holds no Gaussians.")
     table = read_ply(path, ["vertex"])[1]["vertex"]
+    unnamed = [name for name in vertex.names if name != MIP_FILTER]
+    named = select_channel_columns(path, declared_channels(header.comments), unnamed, channels)
+    normal_axis, notes = _normal_axis(dialect, scale_count), dropped_sh_message(degree)
+    used = {*_POSITION, *_NORMAL, *_ROTATION, *_SH_DC, "opacity", MIP_FILTER, *_scale_names(scale_count)}
+    used |= {*_POINT_COLORS, *(column for own in named.values() for column in own)}
+    ignored = [name for name in vertex.names if name not in used and not name.startswith("f_rest_")]
+    if ignored:
+        notes = (*notes, ignored_properties_message(ignored))
+    if dialect == "3dgs" and scale_count == 3 and has_unused_third_scale(table, _scale_names(3)):
+        normal_axis, notes = 2, (*notes, UNUSED_SCALE_MESSAGE)
+    if dialect == "3dgs" and scale_count == 2:
+        notes = (*notes, _FLAT_DIALECT_MESSAGE)
+
+    def block(rows: slice) -> GaussianCloud:
+        cloud = _read_rows(path, table[rows], degree, scale_count, named)
+        cloud = replace(cloud, notes=notes, normal_axis=normal_axis)
+        filtered = MIP_FILTER in vertex.names
+        return with_mip_filter(cloud, columns(table[rows], [MIP_FILTER])[:, 0]) if filtered else cloud
+
+    return CloudBlocks(vertex.count, ((rows, block(rows)) for rows in row_slices(vertex.count)))
+
+
+def _read_rows(
+    path: Path, table: np.ndarray, degree: int, scale_count: int, named: Mapping[str, tuple[str, ...]]
+) -> GaussianCloud:
+    """Return the Gaussians of some rows, with channels of these columns."""
     retained = (min(degree, MAX_SH_DEGREE) + 1) ** 2 - 1
     each = (degree + 1) ** 2 - 1
     names = [f"f_rest_{color * each + k}" for color in range(3) for k in range(retained)]
     colors = columns(table, [*_SH_DC, *names])
     rest = colors[:, 3:].reshape(len(table), 3, retained).transpose(0, 2, 1)
-    unnamed = [name for name in vertex.names if name != _FILTER]
-    found = select_channel_columns(path, declared_channels(header.comments), unnamed, channels)
     try:
-        named = Channels({name: columns(table, own) for name, own in found.items()})
+        found = Channels({name: columns(table, own) for name, own in named.items()})
     except ConfigError as error:
         raise SceneFileError(f"{path}: {error}") from error
-    cloud = GaussianCloud(
+    return GaussianCloud(
         means_world=columns(table, _POSITION),
         quats_wxyz=columns(table, _ROTATION),
         log_scales=columns(table, _scale_names(scale_count)),
         opacity_logits=columns(table, ["opacity"])[:, 0],
         sh=np.ascontiguousarray(np.concatenate([colors[:, None, :3], rest], axis=1)),
-        notes=dropped_sh_message(degree),
-        channels=named,
-        normal_axis=_normal_axis(dialect, scale_count),
+        channels=found,
     )
-    used = {*_POSITION, *_NORMAL, *_ROTATION, *_SH_DC, "opacity", _FILTER, *_scale_names(scale_count)}
-    used |= {*_POINT_COLORS, *(column for own in found.values() for column in own)}
-    ignored = [name for name in vertex.names if name not in used and not name.startswith("f_rest_")]
-    if ignored:
-        cloud = replace(cloud, notes=(*cloud.notes, ignored_properties_message(ignored)))
-    if dialect == "3dgs" and scale_count == 3 and has_unused_third_scale(cloud.log_scales):
-        cloud = replace(cloud, normal_axis=2, notes=(*cloud.notes, UNUSED_SCALE_MESSAGE))
-    if dialect == "3dgs" and scale_count == 2:
-        cloud = replace(cloud, notes=(*cloud.notes, _FLAT_DIALECT_MESSAGE))
-    return _with_mip_filter(cloud, columns(table, [_FILTER])[:, 0]) if _FILTER in vertex.names else cloud
 
 
 _FLAT_DIALECT_MESSAGE = (
@@ -251,30 +278,6 @@ def _normal_axis(dialect: PlyDialect, scale_count: int) -> Literal[0, 2] | None:
     if dialect == "games":
         return 0
     return 2 if dialect == "2dgs" or scale_count == 2 else None
-
-
-def _with_mip_filter(cloud: GaussianCloud, deviations: Float32[np.ndarray, " n"]) -> GaussianCloud:
-    """Return the Gaussians as they are shown by programs that smooth each one.
-
-    Each is convolved with a Gaussian of the given standard deviation, and its opacity is lowered so that
-    the integral stays the same (Mip-Splatting, Eq. 9).
-    """
-    scales = cloud.log_scales.astype(np.float64)
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        # ln sqrt(s^2 + f^2) for the deviations s of the Gaussian and f of the filter
-        wider = 0.5 * np.logaddexp(2.0 * scales, 2.0 * np.log(np.abs(deviations.astype(np.float64)))[:, None])
-        # ln of the ratio of the volumes, without axes that are infinitely thin
-        lost = np.where(np.isfinite(scales), scales - wider, 0.0).sum(axis=1)
-        # ln(ratio) + ln(sigmoid)
-        log_opacity = lost - np.logaddexp(0.0, -cloud.opacity_logits.astype(np.float64))
-        logits = log_opacity - np.log(-np.expm1(log_opacity))  # ln a - ln(1 - a)
-    return replace(
-        cloud,
-        log_scales=wider.astype(np.float32),
-        # Where the filter changes nothing, logits keep every bit.
-        opacity_logits=np.where(lost == 0.0, cloud.opacity_logits, logits).astype(np.float32),
-        notes=(*cloud.notes, f"Its smoothing filter ({_FILTER}) was folded into scales and opacities."),
-    )
 
 
 def declared_channels(comments: Sequence[str]) -> dict[str, tuple[str, ...]]:
@@ -354,7 +357,8 @@ register(
         "Gaussians in the PLY layout of 3DGS",
         read_ply_cloud,
         _recognises,
-        read_channels=read_ply_cloud,
+        read_blocks=read_ply_blocks,
+        holds_channels=True,
     )
 )
 _NAMED_DIALECTS: tuple[tuple[PlyDialect, str], ...] = (
@@ -362,8 +366,16 @@ _NAMED_DIALECTS: tuple[tuple[PlyDialect, str], ...] = (
     ("games", "Gaussians in the PLY layout of GaMeS or REdiSplats, the normal being the first axis"),
 )
 for _dialect, _what in _NAMED_DIALECTS:
-    _read = functools.partial(read_ply_cloud, dialect=_dialect)
-    register(Importer(_dialect, ("*.ply",), _what, _read, read_channels=_read))
+    register(
+        Importer(
+            _dialect,
+            ("*.ply",),
+            _what,
+            functools.partial(read_ply_cloud, dialect=_dialect),
+            read_blocks=functools.partial(read_ply_blocks, dialect=_dialect),
+            holds_channels=True,
+        )
+    )
 register(
     Exporter(
         "gaussians",

@@ -46,6 +46,7 @@ MAX_CHUNKS = 64
 MAX_PRIMITIVES = 100_000
 MAX_CHANNEL_COLUMNS = 10_000
 CHANNELS = "octasplat_channels"
+ALL_ROWS = slice(None)
 GLB_READ_ERRORS = (KeyError, IndexError, TypeError, ValueError, AttributeError)
 """What reading a document that says nonsense may raise."""
 
@@ -94,8 +95,8 @@ class GlbFile:
             raise SceneFileError(f"{path}: has no JSON part.")
         self.document: dict[str, Any] = document
 
-    def array(self, number: int, dtype: DTypeLike) -> np.ndarray:
-        """Return the rows of an accessor as ``dtype``, copied; normalised integers become numbers in [-1, 1].
+    def array(self, number: int, dtype: DTypeLike, rows: slice = ALL_ROWS) -> np.ndarray:
+        """Return rows of an accessor as ``dtype``, copied; normalised integers become numbers in [-1, 1].
 
         Raises:
             KeyError, IndexError, TypeError, ValueError: the document does not describe it, or it is stored in
@@ -115,10 +116,22 @@ class GlbFile:
             raise ValueError(f"accessor {number} has rows that overlap")
         # numpy refuses an array that reaches beyond the buffer.
         values: np.ndarray = np.ndarray((count, width), kind, self._binary, offset, (stride, kind.itemsize))
+        values = values[rows]
         if accessor.get("normalized") and kind.kind in "iu":
             # As glTF has it: the least integer is -1, too.
             values = np.maximum(values.astype(np.float64) / np.iinfo(kind).max, -1.0)
         return values.astype(dtype)
+
+    def count(self, number: int) -> int:
+        """Return the number of rows of an accessor.
+
+        Raises:
+            KeyError, IndexError, TypeError, ValueError: the document does not describe it.
+        """
+        count = int(self.document["accessors"][number]["count"])
+        if count < 0:
+            raise ValueError(f"accessor {number} has {count} rows")
+        return count
 
     def view_bytes(self, number: int) -> bytes:
         """Return the bytes of a buffer view.
@@ -328,6 +341,16 @@ def declared_channel_attributes(document: Mapping[str, Any]) -> dict[str, tuple[
 def json_bytes(document: dict[str, object]) -> bytes:
     """Return a document as it stands in the file, without what fills it up to four bytes."""
     return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+
+
+def part_paths(path: Path, count: int) -> tuple[Path, ...]:
+    """Return the files of a scene for which one is too small: ``path``, ``<stem>.part2.glb`` and so on."""
+    return (path, *(path.with_name(f"{path.stem}.part{k}{path.suffix}") for k in range(2, count + 1)))
+
+
+def part_extras(part: int, count: int) -> dict[str, object]:
+    """Return what the ``extras`` of a file say of its place among so many, from 1; nothing if it is alone."""
+    return {"octasplat_part": [part, count]} if count > 1 else {}
 
 
 def glb_size(json_room: int, length: int) -> int:

@@ -196,14 +196,14 @@ def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions)
     soup = OctagonSoup(gaussians, path, options, OPAQUE_CUTOFF if options.opaque else None)
     png = white_with_alpha_png(options.falloff_texture_size, options.q)
     parts = _plan_files(soup, path, (len(png), len(ramp)), options)
-    paths = [path, *(path.with_name(f"{path.stem}.part{k}{path.suffix}") for k in range(2, len(parts) + 1))]
+    paths = glb_container.part_paths(path, len(parts))
     for part_path, (layout, chunks) in zip(paths, parts, strict=True):
         bounds: list[Bounds] = []
         data = _octagon_data(
             layout=layout, soup=soup, chunks=chunks, images=(png, ramp), options=options, bounds=bounds
         )
         write_glb(part_path, layout.json_room, layout.length, data, lambda: layout.json(bounds))  # noqa: B023
-    return tuple(paths)
+    return paths
 
 
 def _plan_files(
@@ -246,7 +246,7 @@ def _file_extras(soup: OctagonSoup, options: ExportOptions, parts: int) -> list[
     if options.opaque:
         extras["octasplat_opaque_cutoff"] = OPAQUE_CUTOFF
     extras |= glb_container.channel_extras(soup.channel_widths)
-    return [extras | ({"octasplat_part": [part, parts]} if parts > 1 else {}) for part in range(1, parts + 1)]
+    return [extras | glb_container.part_extras(part, parts) for part in range(1, parts + 1)]
 
 
 def _octagon_data(

@@ -10,7 +10,9 @@ from jaxtyping import Float32, Int
 
 from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.files.export_options import ExportOptions
+from octasplat.engine.files.splat_rows import iterate_blocks
 from octasplat.engine.gaussians.channels import Channels
+from octasplat.engine.gaussians.flattening import row_slices
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import (
     APOTHEM,
@@ -18,6 +20,7 @@ from octasplat.engine.gaussians.octagon import (
     octagon_corners_world,
     octagon_radii,
 )
+from octasplat.engine.gaussians.rows import allocate_rows, overwrite_rows
 
 MAX_FLOAT_ID = 1 << 24
 """Numbers below this are exact in float32, the only type that mesh editors keep for custom attributes."""
@@ -84,13 +87,14 @@ class OctagonSoup:
         self.scene_size = len(gaussians)
         self._path = path
         self._gaussians = gaussians
-        self._opacities = gaussians.opacities
-        self._radii = octagon_radii(self._opacities, options.q)
-        if alpha_cutoff is not None:
-            # The octagon surrounds the ellipse: its sides touch it, not its corners.
-            around = octagon_radii(self._opacities, -2.0 * math.log(alpha_cutoff)) / np.float32(APOTHEM)
-            self._radii = np.minimum(self._radii, around)
-        self.ids = np.flatnonzero((self._radii > 0.0) & (self._opacities >= options.min_opacity))
+        self._alpha_cutoff = alpha_cutoff
+        is_shown = [
+            (self._radii(block.opacities) > 0.0) & (block.opacities >= options.min_opacity)
+            for block in iterate_blocks(gaussians.with_base_color_only())
+        ]
+        self.ids = np.flatnonzero(np.concatenate(is_shown)) if is_shown else np.zeros(0, np.int64)
+        # There are no more of them than this holds.
+        self.ids = self.ids.astype(np.int32)
         if not len(self.ids):
             raise SceneFileError(
                 f"{path}: not written, as none of the {len(gaussians)} Gaussians is opaque enough for an "
@@ -99,6 +103,14 @@ class OctagonSoup:
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    def _radii(self, opacities: Float32[np.ndarray, " n"]) -> Float32[np.ndarray, " n"]:
+        radii = octagon_radii(opacities, self.q)
+        if self._alpha_cutoff is None:
+            return radii
+        # The octagon surrounds the ellipse: its sides touch it, not its corners.
+        around = octagon_radii(opacities, -2.0 * math.log(self._alpha_cutoff)) / np.float32(APOTHEM)
+        return np.minimum(radii, around)
 
     @property
     def channel_widths(self) -> dict[str, int]:
@@ -113,8 +125,22 @@ class OctagonSoup:
     def batch(self, places: slice | Int[np.ndarray, " n"]) -> OctagonBatch:
         """Return the octagons at ``places``, which count along ``ids``."""
         ids = self.ids[places]
+        if len(ids) <= BATCH_SIZE:
+            return self._batch(ids)
+        # What it takes to compute one is some times what it comes to.
+        batch: OctagonBatch | None = None
+        for rows in row_slices(len(ids), BATCH_SIZE):
+            part = self._batch(ids[rows])
+            if batch is None:
+                batch = allocate_rows(part, len(ids))
+            overwrite_rows(batch, rows, part)
+        assert batch is not None
+        return batch
+
+    def _batch(self, ids: Int[np.ndarray, " n"]) -> OctagonBatch:
         part = self._gaussians.with_base_color_only().select(ids)
-        radii = self._radii[ids]
+        opacities = part.opacities
+        radii = self._radii(opacities)
         with np.errstate(over="ignore", invalid="ignore"):
             corners = octagon_corners_world(part, radii)
         if not np.isfinite(corners).all():
@@ -130,7 +156,7 @@ class OctagonSoup:
             corners_world=corners,
             uv=uv.astype(np.float32),
             rgb_srgb=rgb,
-            opacities=self._opacities[ids],
+            opacities=opacities,
             radii=radii,
             normals_world=np.ascontiguousarray(part.rotations[:, :, 0]),
             channels=Channels(channels),

@@ -3,9 +3,11 @@
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int
 
 from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.files.octagon_batches import MAX_FLOAT_ID
+from octasplat.engine.gaussians.flattening import row_slices
 from octasplat.engine.gaussians.frames import rotation_matrices
 from octasplat.engine.gaussians.octagon import (
     coordinate_rounding_error,
@@ -15,6 +17,8 @@ from octasplat.engine.gaussians.octagon import (
 
 TOLERANCE = 1e-3
 """Octagons further from a regular one than this, as a share of their size, were edited."""
+OCTAGONS_PER_BLOCK = 4096
+"""Octagons that are dealt with at a time, of which each takes some kilobytes."""
 ONE_COLOR_NOTE = "It holds one color of each Gaussian, no harmonics."
 
 
@@ -39,6 +43,35 @@ def gaussians_from_octagons(
     if not good.all() or (off > TOLERANCE * size + 4.0 * coordinate_rounding_error(corners_world)).any():
         raise edited_octagons_error(path)
     return means, quats, log_scales
+
+
+class OctagonOrder:
+    """Where octagons belong that are to follow each other by the numbers of their Gaussians.
+
+    Attributes:
+        are_unique: whether no two have the same number, as far as numbers are those of a scene.
+    """
+
+    def __init__(self, ids: Float32[np.ndarray, " n"]) -> None:
+        """Take the numbers in the order of the file."""
+        self._ids = ids
+        self.are_unique = False
+        self._places = np.zeros(0, np.int32)
+        """Of each number that there is the place of its octagon; else of each octagon."""
+        if len(ids) and ids.min() >= 0 and ids.max() <= MAX_FLOAT_ID:
+            is_there = np.zeros(int(ids.max()) + 1, bool)
+            for rows in row_slices(len(ids)):
+                is_there[ids[rows].astype(np.int64)] = True
+            self._places = np.cumsum(is_there, dtype=np.int32) - np.int32(1)
+            self.are_unique = int(self._places[-1]) == len(ids) - 1
+        if not self.are_unique:
+            order = np.argsort(ids, kind="stable")
+            self._places = np.empty(len(ids), np.int64)
+            self._places[order] = np.arange(len(ids))
+
+    def places(self, rows: slice) -> Int[np.ndarray, " n"]:
+        """Return where the octagons of some rows of the file belong."""
+        return self._places[self._ids[rows].astype(np.int64)] if self.are_unique else self._places[rows]
 
 
 def edited_octagons_error(path: Path) -> SceneFileError:

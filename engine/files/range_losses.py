@@ -4,10 +4,13 @@ Each format says in a function of its own what it loses; this module counts and 
 """
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float
 
+from octasplat.engine.files.splat_rows import iterate_blocks
+from octasplat.engine.gaussians.flattening import row_slices
 from octasplat.engine.gaussians.model import FlatGaussians
 
 MIN_REPORTED_FRACTION = 1e-3
@@ -25,12 +28,14 @@ def find_size_losses(
         min_log_scale: ln of the least deviation that it holds.
         max_log_scale: ln of the largest.
     """
-    log_scales = scene.log_scales.astype(np.float64)
-    large = int((log_scales > max_log_scale).any(axis=1).sum())
-    small = int((log_scales < min_log_scale).any(axis=1).sum())
+    large = small = 0
+    for block in iterate_blocks(scene):
+        log_scales = block.log_scales.astype(np.float64)
+        large += int((log_scales > max_log_scale).any(axis=1).sum())
+        small += int((log_scales < min_log_scale).any(axis=1).sum())
     if not large and small < MIN_REPORTED_FRACTION * len(scene):
         return ()
-    low, high = float(log_scales.min()), float(log_scales.max())
+    low, high = float(scene.log_scales.min()), float(scene.log_scales.max())
     advice = ""
     if high - low < max_log_scale - min_log_scale:
         # A power of ten where one fits, so that units stay easy to tell.
@@ -48,18 +53,22 @@ def find_size_losses(
 def find_position_losses(
     format_name: str,
     scene: FlatGaussians,
-    step_world: Float[np.ndarray, " n"] | float,
+    steps_world: Callable[[slice], Float[np.ndarray, " n"] | float],
 ) -> tuple[str, ...]:
     """Return what becomes of Gaussians that are smaller than the steps in which a format holds positions.
 
     Args:
         format_name: of the format.
         scene: what is written.
-        step_world: step of each position, world units.
+        steps_world: returns the step of each position of some rows, or one step for all, world units.
     """
-    coarse = int((step_world > np.exp(scene.log_scales.astype(np.float64)).max(axis=1)).sum())
+    coarse = 0
+    for rows in row_slices(len(scene)):
+        sizes = np.exp(scene.log_scales[rows].astype(np.float64)).max(axis=1)
+        coarse += int((steps_world(rows) > sizes).sum())
     if coarse < max(1.0, MIN_REPORTED_FRACTION * len(scene)):
         return ()
+    step_world = np.concatenate([np.atleast_1d(steps_world(rows)) for rows in row_slices(len(scene))])
     return (
         f"The format {format_name} holds positions in steps of {float(np.median(step_world)):.2g} "
         f"units here, which is more than the size of {coarse:,} of {len(scene):,} Gaussians; "
@@ -76,7 +85,9 @@ def find_harmonic_losses(format_name: str, scene: FlatGaussians, limit: float) -
         scene: what is written.
         limit: the largest absolute value of a coefficient of degree 1 and above.
     """
-    clipped = int((np.abs(scene.sh[:, 1:]) > limit).any(axis=(1, 2)).sum())
+    clipped = 0
+    for block in iterate_blocks(scene):
+        clipped += int((np.abs(block.sh[:, 1:]) > limit).any(axis=(1, 2)).sum())
     if clipped < max(1.0, MIN_REPORTED_FRACTION * len(scene)):
         return ()
     return (

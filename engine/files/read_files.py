@@ -49,12 +49,10 @@ def read_scene(
     source = _scene_file(path)
     importer = importer_for(source, format)
     with phase("read", progress):
-        if importer.read_channels is not None:
-            cloud = importer.read_channels(source, channels)
-        elif channels not in ("own", "all", ()):
+        if not importer.holds_channels and channels not in ("own", "all", ()):
             raise SceneFileError(f"{source}: the format {importer.name} has no place for channels.")
-        else:
-            cloud = importer.read(source)
+        read = importer.read_blocks
+        cloud = importer.read(source) if read is None else read(source, channels)
         return flatten(cloud, source, drop_invalid=drop_invalid)
 
 

@@ -13,7 +13,7 @@ from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.files.channel_columns import ChannelChoice
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.format_table import Entry, FormatTable
-from octasplat.engine.gaussians.flattening import GaussianCloud
+from octasplat.engine.gaussians.flattening import CloudBlocks, GaussianCloud
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.scene_metadata import SceneMetadata
 from octasplat.engine.geometry.imported_mesh import ImportedMesh
@@ -42,14 +42,17 @@ class Importer(Entry):
         description: one line for help texts.
         read: reads the Gaussians as the file has them, in the world frame of the 3DGS family (y down).
         matches_head: whether a file that begins with these bytes (up to ``HEAD_BYTES``) is of this format.
-        read_channels: reads the channels that are wanted, too; None where the format has no place for any.
+        read_blocks: reads what ``read`` does some thousands of Gaussians at a time, so that memory is that of
+            the scene, and the channels that are wanted, too; None where the format does not allow for it.
+        holds_channels: whether the format has a place for channels.
     """
 
     noun: ClassVar[str] = "import"
     description: str
     read: SceneReader
     matches_head: Callable[[bytes], bool] = lambda _head: False
-    read_channels: Callable[[Path, ChannelChoice], GaussianCloud] | None = None
+    read_blocks: Callable[[Path, ChannelChoice], CloudBlocks] | None = None
+    holds_channels: bool = False
 
 
 @dataclass(frozen=True)

@@ -6,18 +6,20 @@ the program splat-transform, where that is.
 """
 
 import json
+import shutil
 import tempfile
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Float64, UInt8
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.core.image_messages import image_message
 from octasplat.engine.core.writing import atomic_replace
+from octasplat.engine.files.channel_columns import ChannelChoice
 from octasplat.engine.files.encodings import SQRT_HALF, from_smallest_three, logits_from_bytes
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
@@ -25,7 +27,7 @@ from octasplat.engine.files.range_losses import find_position_losses
 from octasplat.engine.files.registry import Exporter, Importer, register
 from octasplat.engine.files.splat_rows import select_for_export
 from octasplat.engine.files.splat_transform import convert, missing_converter
-from octasplat.engine.gaussians.flattening import GaussianCloud
+from octasplat.engine.gaussians.flattening import CloudBlocks, GaussianCloud, join_blocks, row_slices
 from octasplat.engine.gaussians.model import FlatGaussians
 
 META_FILE = "meta.json"
@@ -71,6 +73,11 @@ def read(path: Path) -> GaussianCloud:
     Raises:
         SceneFileError: the file is no SOG, an image is missing or too small, or a number is out of range.
     """
+    return join_blocks(_read_blocks(path), path)
+
+
+def _read_blocks(path: Path, _channels: ChannelChoice = "own") -> CloudBlocks:
+    """Return the Gaussians some thousands at a time; the images are in memory, in bytes."""
     try:
         if path.stat().st_size == 0:
             raise SceneFileError(f"{path}: is empty.")
@@ -139,7 +146,7 @@ def _rgba_pixels(path: Path, name: str, image: Path) -> UInt8[np.ndarray, "h w 4
     return np.ascontiguousarray(pixels[:, :, :4])
 
 
-def _decode(path: Path, text: bytes, images: Images) -> GaussianCloud:
+def _decode(path: Path, text: bytes, images: Images) -> CloudBlocks:
     try:
         meta = _Meta.model_validate(json.loads(text))
     except (ValidationError, ValueError, RecursionError) as error:
@@ -161,25 +168,50 @@ def _decode(path: Path, text: bytes, images: Images) -> GaussianCloud:
             )
         return pixels[:count]
 
-    low, high = rgba(meta.means)[:, :3], rgba(meta.means, 1)[:, :3]
+    pixels = {
+        "low": rgba(meta.means),
+        "high": rgba(meta.means, 1),
+        "scales": rgba(meta.scales),
+        "color": rgba(meta.sh0),
+        "quats": rgba(meta.quats),
+    }
+    palette = None
+    if meta.shN is not None:
+        palette = _palette(path, meta.shN, images)
+        pixels["labels"] = rgba(meta.shN, 1)
+
+    def block(rows: slice) -> GaussianCloud:
+        return _decode_rows(path, meta, {name: image[rows] for name, image in pixels.items()}, palette)
+
+    return CloudBlocks(count, ((rows, block(rows)) for rows in row_slices(count)))
+
+
+def _decode_rows(
+    path: Path,
+    meta: _Meta,
+    pixels: Mapping[str, UInt8[np.ndarray, "n 4"]],
+    palette: Float32[np.ndarray, "p k 3"] | None,
+) -> GaussianCloud:
+    """Return the Gaussians of some pixels of each image."""
+    low, high = pixels["low"][:, :3], pixels["high"][:, :3]
     # One image has the low bytes, the other the high ones.
     curved = _dequantise(path, meta.means, (low.astype(np.float64) + 256.0 * high) / 65535.0)
-    color = rgba(meta.sh0)
+    color = pixels["color"]
     if meta.version == 2:
-        scales = _codebook_values(path, meta.scales, rgba(meta.scales)[:, :3])
+        scales = _codebook_values(path, meta.scales, pixels["scales"][:, :3])
         constant = _codebook_values(path, meta.sh0, color[:, :3])
         logits = logits_from_bytes(color[:, 3])
     else:
-        scales = _dequantise(path, meta.scales, rgba(meta.scales)[:, :3] / 255.0).astype(np.float32)
+        scales = _dequantise(path, meta.scales, pixels["scales"][:, :3] / 255.0).astype(np.float32)
         both = _dequantise(path, meta.sh0, color / 255.0).astype(np.float32)
         constant, logits = both[:, :3], both[:, 3]
     sh = constant[:, None, :]
-    if meta.shN is not None:
-        sh = np.concatenate([sh, _sh_rest(path, meta.shN, images, rgba(meta.shN, 1))], axis=1)
+    if palette is not None:
+        sh = np.concatenate([sh, _sh_rest(path, palette, pixels["labels"])], axis=1)
     return GaussianCloud(
         # inverse of sign(x) ln(1 + |x|)
         means_world=(np.sign(curved) * np.expm1(np.abs(curved))).astype(np.float32),
-        quats_wxyz=_decode_rotations(rgba(meta.quats)),
+        quats_wxyz=_decode_rotations(pixels["quats"]),
         log_scales=scales,
         opacity_logits=np.ascontiguousarray(logits),
         sh=np.ascontiguousarray(sh),
@@ -220,10 +252,8 @@ def _decode_rotations(rgba: UInt8[np.ndarray, "n 4"]) -> Float32[np.ndarray, "n 
     return quats
 
 
-def _sh_rest(
-    path: Path, part: _ParameterMeta, images: Images, labels: UInt8[np.ndarray, "n 4"]
-) -> Float32[np.ndarray, "n k 3"]:
-    """Decode higher harmonics: each Gaussian indexes a palette with 64 entries a row."""
+def _palette(path: Path, part: _ParameterMeta, images: Images) -> Float32[np.ndarray, "p k 3"]:
+    """Decode the palette of higher harmonics, 64 entries a row."""
     pixels = images(part.files[0])
     rows, width = pixels.shape[:2]
     k = width // PALETTE_COLUMNS
@@ -240,7 +270,13 @@ def _sh_rest(
         if len(low) != 1 or len(high) != 1:
             raise SceneFileError(f"{path}: its {META_FILE} should give one bound for {part.files[0]}.")
         palette = (low + (high - low) * (pixels[:, :, :3] / 255.0)).astype(np.float32)
-    palette = palette.reshape(rows * PALETTE_COLUMNS, k, 3)
+    return palette.reshape(rows * PALETTE_COLUMNS, k, 3)
+
+
+def _sh_rest(
+    path: Path, palette: Float32[np.ndarray, "p k 3"], labels: UInt8[np.ndarray, "n 4"]
+) -> Float32[np.ndarray, "n k 3"]:
+    """Decode higher harmonics: each Gaussian indexes the palette."""
     # low byte in red, high byte in green
     entry = labels[:, 0].astype(np.int64) + 256 * labels[:, 1].astype(np.int64)
     if len(entry) and int(entry.max()) >= len(palette):
@@ -265,7 +301,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
             convert(source, target)
         except SceneFileError as error:
             raise SceneFileError(str(error).replace(str(target), str(path), 1)) from error
-        temporary.write_bytes(target.read_bytes())
+        shutil.copyfile(target, temporary)
     return (path,)
 
 
@@ -273,11 +309,15 @@ def find_sog_losses(scene: FlatGaussians) -> tuple[str, ...]:
     """Return what positions of 16 bits lose of a scene, in sentences."""
     if len(scene) == 0 or not scene.is_finite():
         return ()  # which is refused
-    means = scene.means_world.astype(np.float64)
-    curved = np.sign(means) * np.log1p(np.abs(means))
-    step = np.ptp(curved, axis=0) / 65535.0
-    # dx = (1 + |x|) d(ln(1 + |x|))
-    return find_position_losses("sog", scene, ((1.0 + np.abs(means)) * step).max(axis=1))
+    ends = np.stack([scene.means_world.min(axis=0), scene.means_world.max(axis=0)]).astype(np.float64)
+    step = np.ptp(np.sign(ends) * np.log1p(np.abs(ends)), axis=0) / 65535.0
+
+    def steps_world(rows: slice) -> Float64[np.ndarray, " n"]:
+        # dx = (1 + |x|) d(ln(1 + |x|))
+        steps = (1.0 + np.abs(scene.means_world[rows].astype(np.float64))) * step
+        return np.asarray(steps.max(axis=1))
+
+    return find_position_losses("sog", scene, steps_world)
 
 
 def _recognises(head: bytes) -> bool:
@@ -291,6 +331,7 @@ register(
         "SOG of PlayCanvas, bundled or as a folder's meta.json",
         read,
         _recognises,
+        read_blocks=_read_blocks,
     )
 )
 register(

@@ -7,11 +7,12 @@ import numpy as np
 from octasplat.engine.core.color import round_to_bytes
 from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.core.writing import atomic_replace
+from octasplat.engine.files.channel_columns import ChannelChoice
 from octasplat.engine.files.encodings import logits_from_bytes, sh0_from_rgb, unit_quats
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.registry import Exporter, Importer, register
 from octasplat.engine.files.splat_rows import check_scales, iterate_blocks, select_for_export
-from octasplat.engine.gaussians.flattening import GaussianCloud
+from octasplat.engine.gaussians.flattening import CloudBlocks, GaussianCloud, join_blocks, row_slices
 from octasplat.engine.gaussians.model import FLAT_SCALE, FlatGaussians
 
 SPLAT_DTYPE = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat_wxyz", "u1", 4)])
@@ -23,15 +24,24 @@ def read(path: Path) -> GaussianCloud:
     Raises:
         SceneFileError: the size is not a multiple of 32 bytes, or the file cannot be read.
     """
+    return join_blocks(_read_blocks(path), path)
+
+
+def _read_blocks(path: Path, _channels: ChannelChoice = "own") -> CloudBlocks:
     try:
         size = path.stat().st_size
         if size % SPLAT_DTYPE.itemsize:
             raise SceneFileError(
                 f"{path}: is no .splat, or is truncated; its {size} bytes are not a multiple of 32."
             )
-        rows = np.fromfile(path, dtype=SPLAT_DTYPE)
+        # an empty file cannot be mapped
+        table = np.memmap(path, SPLAT_DTYPE, "r") if size else np.zeros(0, SPLAT_DTYPE)
     except OSError as error:
         raise SceneFileError(f"{path}: cannot be read ({error.strerror or error}).") from error
+    return CloudBlocks(len(table), ((rows, _decode(table[rows])) for rows in row_slices(len(table))))
+
+
+def _decode(rows: np.ndarray) -> GaussianCloud:
     with np.errstate(divide="ignore", invalid="ignore"):
         log_scales = np.log(rows["scale"])
     return GaussianCloud(
@@ -72,5 +82,7 @@ def _splat_rows(some: FlatGaussians) -> np.ndarray:
     return rows
 
 
-register(Importer("splat", ("*.splat",), "32 bytes a Gaussian (antimatter15)", read))
+register(
+    Importer("splat", ("*.splat",), "32 bytes a Gaussian (antimatter15)", read, read_blocks=_read_blocks)
+)
 register(Exporter("splat", ("*.splat",), "32 bytes a Gaussian for web viewers (antimatter15)", write))

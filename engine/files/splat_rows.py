@@ -7,9 +7,9 @@ import numpy as np
 
 from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.files.export_options import ExportOptions
+from octasplat.engine.gaussians.flattening import row_slices
 from octasplat.engine.gaussians.model import FlatGaussians
 
-ROWS_PER_BLOCK = 65536
 # A little less than the largest, whose power may be rounded to infinity
 MAX_LOG_SCALE = float(np.log(np.finfo(np.float32).max)) - 1e-3
 
@@ -26,7 +26,8 @@ def select_for_export(gaussians: FlatGaussians, path: Path, options: ExportOptio
         raise SceneFileError(f"{path}: not written, as some Gaussians hold values that are not finite.")
     if options.min_opacity > 0.0:
         count = len(gaussians)
-        gaussians = gaussians.select(gaussians.opacities >= options.min_opacity)
+        is_kept = [block.opacities >= options.min_opacity for block in iterate_blocks(gaussians)]
+        gaussians = gaussians.select(np.concatenate(is_kept))
         if not len(gaussians):
             raise SceneFileError(f"{path}: not written; all {count} Gaussians are below min_opacity.")
     return gaussians
@@ -44,6 +45,5 @@ def check_scales(scene: FlatGaussians, path: Path) -> None:
 
 def iterate_blocks(scene: FlatGaussians) -> Iterator[FlatGaussians]:
     """Yield the scene in order, a few thousand Gaussians at a time, without copying it."""
-    for start in range(0, len(scene), ROWS_PER_BLOCK):
-        part = slice(start, start + ROWS_PER_BLOCK)
+    for part in row_slices(len(scene)):
         yield scene.view(part)

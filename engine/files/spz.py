@@ -1,6 +1,5 @@
 """SPZ (Niantic), about 15 bytes a Gaussian: versions 2, 3 and 4 in, 3, which every viewer reads, or 4 out."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +8,7 @@ from jaxtyping import Float, Float32
 from octasplat.engine.core.color import round_to_bytes
 from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.core.writing import atomic_replace
+from octasplat.engine.files.channel_columns import ChannelChoice
 from octasplat.engine.files.encodings import (
     MAX_SH_DEGREE,
     SQRT_HALF,
@@ -29,8 +29,23 @@ from octasplat.engine.files.range_losses import (
 )
 from octasplat.engine.files.registry import Exporter, Importer, register
 from octasplat.engine.files.splat_rows import iterate_blocks, select_for_export
-from octasplat.engine.files.spz_container import ANTIALIASED, GZIP_MAGIC, MAGIC, SpzFile, pack_spz, read_spz
-from octasplat.engine.gaussians.flattening import FLAT_LOG_SCALE, GaussianCloud
+from octasplat.engine.files.spz_container import (
+    ANTIALIASED,
+    GZIP_MAGIC,
+    MAGIC,
+    SpzContent,
+    SpzHeader,
+    SpzSource,
+    open_spz,
+    write_spz,
+)
+from octasplat.engine.gaussians.flattening import (
+    FLAT_LOG_SCALE,
+    CloudBlocks,
+    GaussianCloud,
+    join_blocks,
+    row_slices,
+)
 from octasplat.engine.gaussians.model import FlatGaussians
 
 COLOR_SCALE = 0.15
@@ -39,6 +54,8 @@ LOG_SCALE_STEPS = 16.0
 LOG_SCALE_OFFSET = 10.0
 FRACTIONAL_BITS = 12
 """The least precision of positions where they fit: 1/4096 of a unit."""
+MAX_READ = 10_000_000
+"""Gaussians that Niantic's reader takes, whatever the file says."""
 SMALL_QUANTILE = 0.05
 STEPS_PER_SIGMA = 8.0
 """Positions get as many more bits as it takes to place a small Gaussian this finely."""
@@ -52,28 +69,34 @@ def read(path: Path) -> GaussianCloud:
     Raises:
         SceneFileError: the file is no SPZ, is damaged, or of an unknown version.
     """
-    cloud = decode(path, read_spz(path))
-    return replace(
-        cloud,
-        means_world=half_turn_points(cloud.means_world),
-        quats_wxyz=half_turn_quats(cloud.quats_wxyz),
-        sh=half_turn_sh(cloud.sh),
-    )
+    return join_blocks(_read_blocks(path), path)
 
 
-def decode(path: Path, file: SpzFile) -> GaussianCloud:
+def _read_blocks(path: Path, _channels: ChannelChoice = "own") -> CloudBlocks:
+    found = decode(open_spz(path))
+    return CloudBlocks(found.count, ((rows, half_turn_gaussians(cloud)) for rows, cloud in found.blocks))
+
+
+def decode(source: SpzSource) -> CloudBlocks:
     """Return all Gaussians as they stand in a file: y up.
 
     Raises:
         SceneFileError: there are none.
     """
-    if file.count == 0:
-        raise SceneFileError(f"{path}: holds no Gaussians.")
+    count = source.header.count
+    if count == 0:
+        raise SceneFileError(f"{source.path}: holds no Gaussians.")
+    found = source.blocks(row_slices(count))
+    return CloudBlocks(count, ((rows, _decode_block(source.header, streams)) for rows, streams in found))
+
+
+def _decode_block(file: SpzHeader, streams: tuple[bytes, ...]) -> GaussianCloud:
+    count = len(streams[1])  # a byte of opacity for each
     positions, opacities, colors, scales, rotations, harmonics = (
-        np.frombuffer(stream, np.uint8).reshape(file.count, -1) for stream in file.streams
+        np.frombuffer(stream, np.uint8).reshape(count, -1) for stream in streams
     )
     retained = (min(file.sh_degree, MAX_SH_DEGREE) + 1) ** 2
-    rest = (harmonics.reshape(file.count, -1, 3)[:, : retained - 1].astype(np.float32) - 128.0) / 128.0
+    rest = (harmonics.reshape(count, -1, 3)[:, : retained - 1].astype(np.float32) - 128.0) / 128.0
     constant = (colors.astype(np.float32) / 255.0 - 0.5) / COLOR_SCALE
     sh = np.concatenate([constant[:, None, :], rest], axis=1).astype(np.float32)
     quats = _decode_xyz(rotations) if file.version == 2 else _decode_smallest_three(rotations)
@@ -123,68 +146,86 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
         OSError: the file cannot be written.
     """
     scene = select_for_export(gaussians, path, options)
-    file = encode(scene, path, options.spz_version)
-    with atomic_replace(path) as temporary:
-        temporary.write_bytes(pack_spz(file))
+    content = encode(scene, path, options.spz_version)
+    with atomic_replace(path) as temporary, temporary.open("wb") as handle:
+        write_spz(content, handle)
     return (path,)
 
 
-def encode(scene: FlatGaussians, path: Path, version: int) -> SpzFile:
+def encode(scene: FlatGaussians, path: Path, version: int) -> SpzContent:
     """Return the Gaussians in their order, turned to y up, as an SPZ of version 3 or 4.
+
+    Each attribute is made when it is asked for, some thousands of Gaussians at a time.
 
     Raises:
         SceneFileError: positions are beyond what 24 bits hold; it names ``path``.
     """
     if _fitting_bits(scene) < 0:
-        farthest = float(np.abs(scene.means_world).max())
+        farthest = _farthest(scene)
         raise SceneFileError(
             f"{path}: not written; SPZ holds positions up to {2**23 - 1} units, one lies at {farthest:.3g}."
         )
     bits = _fractional_bits(scene)
-    streams = [bytearray() for _ in range(6)]
-    for block in iterate_blocks(scene):
-        for stream, data in zip(streams, _pack_block(half_turn_gaussians(block), bits), strict=True):
-            stream += data
-    return SpzFile(
-        version=version,
-        count=len(scene),
-        sh_degree=scene.sh_degree,
-        fractional_bits=bits,
-        flags=0,
-        streams=tuple(bytes(stream) for stream in streams),
+    header = SpzHeader(version, len(scene), scene.sh_degree, bits, flags=0)
+    packers = (
+        lambda block: _pack_positions(half_turn_points(block.means_world).astype(np.float64) * (1 << bits)),
+        lambda block: round_to_bytes(block.opacities.astype(np.float64) * 255.0).tobytes(),
+        _pack_colors,
+        _pack_scales,
+        lambda block: _pack_rotations(half_turn_quats(block.quats_wxyz)),
+        lambda block: _pack_sh(half_turn_sh(block.sh)),
     )
+    return SpzContent(header, [map(pack, iterate_blocks(scene)) for pack in packers])
 
 
-def _pack_block(scene: FlatGaussians, bits: int) -> tuple[bytes, ...]:
-    """Return the six attributes of a block that is y up."""
+def _pack_colors(scene: FlatGaussians) -> bytes:
+    return round_to_bytes((scene.sh[:, 0].astype(np.float64) * COLOR_SCALE + 0.5) * 255.0).tobytes()
+
+
+def _pack_scales(scene: FlatGaussians) -> bytes:
     log_scales = np.concatenate([np.full((len(scene), 1), FLAT_LOG_SCALE), scene.log_scales], axis=1)
-    return (
-        _pack_positions(scene.means_world.astype(np.float64) * (1 << bits)),
-        round_to_bytes(scene.opacities.astype(np.float64) * 255.0).tobytes(),
-        round_to_bytes((scene.sh[:, 0].astype(np.float64) * COLOR_SCALE + 0.5) * 255.0).tobytes(),
-        round_to_bytes((log_scales.astype(np.float64) + LOG_SCALE_OFFSET) * LOG_SCALE_STEPS).tobytes(),
-        _pack_rotations(scene),
-        _pack_sh(scene),
-    )
+    return round_to_bytes((log_scales.astype(np.float64) + LOG_SCALE_OFFSET) * LOG_SCALE_STEPS).tobytes()
 
 
 def _fitting_bits(scene: FlatGaussians) -> int:
     """Return how many fractional bits the farthest position leaves; negative where it has no room."""
-    largest = float(np.abs(scene.means_world).max())
+    largest = _farthest(scene)
     return int(np.floor(np.log2((2**23 - 1) / max(largest, 1.0 / 256.0))))  # 2^bits |x| <= 2^23 - 1
 
 
+def _farthest(scene: FlatGaussians) -> float:
+    """Return the largest absolute coordinate."""
+    return float(max(-scene.means_world.min(), scene.means_world.max()))
+
+
 def _fractional_bits(scene: FlatGaussians) -> int:
-    small = float(np.quantile(scene.log_scales.min(axis=1).astype(np.float64), SMALL_QUANTILE))
+    small = _quantile_in_place(np.minimum(scene.log_scales[:, 0], scene.log_scales[:, 1]), SMALL_QUANTILE)
     needed = int(np.ceil(np.log2(STEPS_PER_SIGMA) - small / np.log(2.0)))  # 2^bits sigma >= STEPS_PER_SIGMA
     return min(max(needed, FRACTIONAL_BITS), _fitting_bits(scene), 23)
+
+
+def _quantile_in_place(values: Float32[np.ndarray, " n"], share: float) -> float:
+    """Return what ``np.quantile`` does of the same numbers in 64 bits, which would take thrice the memory."""
+    place = share * (len(values) - 1)
+    below = int(place)
+    values.partition([below, min(below + 1, len(values) - 1)])
+    low, high = float(values[below]), float(values[min(below + 1, len(values) - 1)])
+    part = place - below
+    return low + (high - low) * part if part < 0.5 else high - (high - low) * (1 - part)
 
 
 def _find_losses(scene: FlatGaussians) -> tuple[str, ...]:
     if len(scene) == 0 or not scene.is_finite() or _fitting_bits(scene) < 0:
         return ()  # which is refused
     sizes, harmonics = find_range_losses("spz", scene)
-    return (*sizes, *find_position_losses("spz", scene, 2.0 ** -_fractional_bits(scene)), *harmonics)
+    step = 2.0 ** -_fractional_bits(scene)
+    count: tuple[str, ...] = ()
+    if len(scene) > MAX_READ:
+        count = (
+            f"Niantic's reader, which many viewers use, takes no SPZ of more than {MAX_READ:,} Gaussians; "
+            f"this one has {len(scene):,} (octasplat simplify, or several files by octasplat crop).",
+        )
+    return (*count, *sizes, *find_position_losses("spz", scene, lambda _rows: step), *harmonics)
 
 
 def find_range_losses(format_name: str, scene: FlatGaussians) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -207,20 +248,20 @@ def _pack_positions(steps: Float[np.ndarray, "n 3"]) -> bytes:
     return integers.view(np.uint8).reshape(*steps.shape, 4)[:, :, :3].tobytes()  # the three low bytes
 
 
-def _pack_rotations(scene: FlatGaussians) -> bytes:
-    small, largest = smallest_three(scene.quats_wxyz[:, [1, 2, 3, 0]])
+def _pack_rotations(quats_wxyz: Float32[np.ndarray, "n 4"]) -> bytes:
+    small, largest = smallest_three(quats_wxyz[:, [1, 2, 3, 0]])
     sizes = np.minimum(np.rint(np.abs(small) / SQRT_HALF * 511.0), 511.0).astype(np.uint32)
     fields = sizes | (np.uint32(512) * (small < 0).astype(np.uint32))
     words = (largest.astype(np.uint32) << 30) | (fields[:, 0] << 20) | (fields[:, 1] << 10) | fields[:, 2]
     return words.astype("<u4").tobytes()
 
 
-def _pack_sh(scene: FlatGaussians) -> bytes:
-    if scene.sh_degree == 0:
+def _pack_sh(sh: Float32[np.ndarray, "n k 3"]) -> bytes:
+    if sh.shape[1] == 1:
         return b""
-    steps = np.full((scene.sh.shape[1] - 1, 1), SH_STEPS[1], dtype=np.float64)
+    steps = np.full((sh.shape[1] - 1, 1), SH_STEPS[1], dtype=np.float64)
     steps[:3] = SH_STEPS[0]
-    bins = np.rint(scene.sh[:, 1:].astype(np.float64) * 128.0 / steps)
+    bins = np.rint(sh[:, 1:].astype(np.float64) * 128.0 / steps)
     return round_to_bytes(bins * steps + 128.0).tobytes()
 
 
@@ -228,7 +269,11 @@ def _recognises(head: bytes) -> bool:
     return head.startswith((MAGIC, GZIP_MAGIC))
 
 
-register(Importer("spz", ("*.spz",), "SPZ of Niantic, versions 2 to 4", read, _recognises))
+register(
+    Importer(
+        "spz", ("*.spz",), "SPZ of Niantic, versions 2 to 4", read, _recognises, read_blocks=_read_blocks
+    )
+)
 register(
     Exporter(
         "spz",

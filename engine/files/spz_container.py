@@ -4,12 +4,17 @@ Attributes follow each other whole: positions, opacities, colors, scales, rotati
 y up, z backward; harmonics beyond degree 3 are left to the caller.
 """
 
+import contextlib
 import gzip
 import io
+import mmap
 import struct
+import tempfile
 import zlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO, Protocol, cast, runtime_checkable
 
 import zstandard
 
@@ -28,11 +33,15 @@ _GZIP_RATIO = 1040
 """Deflate compresses no better than this, so a header that promises more is wrong."""
 _ZSTD_RATIO = 1 << 17
 _MAX_EXTENSIONS = 1 << 24
+_SKIPPED_BYTES = 1 << 20
+
+
+BinaryFile = IO[bytes] | io.BytesIO
 
 
 @dataclass(frozen=True)
-class SpzFile:
-    """An SPZ file without its compression.
+class SpzHeader:
+    """What an SPZ says of its Gaussians.
 
     Attributes:
         version: 2, 3 or 4.
@@ -40,7 +49,6 @@ class SpzFile:
         sh_degree: 0 to 4.
         fractional_bits: of the 24-bit fixed-point positions.
         flags: bits, of which ``ANTIALIASED`` is one.
-        streams: the six attributes, packed.
     """
 
     version: int
@@ -48,29 +56,165 @@ class SpzFile:
     sh_degree: int
     fractional_bits: int
     flags: int
-    streams: tuple[bytes, ...]
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """Return bytes per Gaussian of positions, opacities, colors, scales, rotations and harmonics."""
+        harmonics = 3 * ((self.sh_degree + 1) ** 2 - 1)
+        return (9, 1, 3, 3, 3 if self.version == 2 else 4, harmonics)
 
 
-def stream_widths(version: int, sh_degree: int) -> tuple[int, ...]:
-    """Return bytes per Gaussian of positions, opacities, colors, scales, rotations and harmonics."""
-    return (9, 1, 3, 3, 3 if version == 2 else 4, 3 * ((sh_degree + 1) ** 2 - 1))
+@dataclass(frozen=True)
+class SpzContent:
+    """An SPZ to be written.
+
+    Attributes:
+        header: what it says of its Gaussians.
+        streams: the six attributes, packed, each in pieces that are made when they are asked for.
+    """
+
+    header: SpzHeader
+    streams: Sequence[Iterable[bytes]]
 
 
-def read_spz(path: Path) -> SpzFile:
-    """Read and decompress a file.
+@runtime_checkable
+class _Readable(Protocol):
+    def read(self, size: int, /) -> bytes: ...
+
+
+class SpzSource:
+    """An SPZ to be read, some Gaussians at a time; its attributes are unpacked side by side.
+
+    Attributes:
+        path: file that it is from, for errors.
+        header: what it says of its Gaussians.
+    """
+
+    def __init__(self, path: Path, open_content: Callable[[], BinaryFile], size: int) -> None:
+        """Read the header.
+
+        Args:
+            path: file that it is from, for errors.
+            open_content: opens all of the SPZ, of which six are open at a time.
+            size: of it in bytes.
+
+        Raises:
+            SceneFileError: it is no SPZ, is damaged, or is of an unknown version.
+        """
+        self.path = path
+        self._open = open_content
+        self._size = size
+        self._toc: list[tuple[int, int]] = []
+        """Of version 4, where each attribute begins and its length, packed."""
+        with _name_errors(path), open_content() as handle:
+            start = handle.read(len(MAGIC))
+            handle.seek(0)
+            if start == MAGIC:
+                self.header = self._read_contents(handle)
+            elif start.startswith(GZIP_MAGIC):
+                self.header = self._read_gzip_header(handle)
+            else:
+                raise SceneFileError(f"{path}: is no SPZ file.")
+
+    def blocks(self, rows: Iterable[slice]) -> Iterator[tuple[slice, tuple[bytes, ...]]]:
+        """Yield the six attributes of the rows of each slice; slices follow each other from the first row on.
+
+        Raises:
+            SceneFileError: the file is truncated or damaged.
+        """
+        with contextlib.ExitStack() as stack, _name_errors(self.path):
+            handles = [self._open_attribute(number, stack) for number in range(6)]
+            for part in rows:
+                lengths = [(part.stop - part.start) * width for width in self.header.widths]
+                found = tuple(handle.read(length) for handle, length in zip(handles, lengths, strict=True))
+                if any(len(piece) < length for piece, length in zip(found, lengths, strict=True)):
+                    raise _truncated_error(self.path, self.header.count)
+                yield part, found
+            if not self._toc:
+                handles[-1].read(_MAX_EXTENSIONS)  # at the end of the stream its checksum is looked at
+
+    def _open_attribute(self, number: int, stack: contextlib.ExitStack) -> _Readable:
+        """Open an attribute, unpacked, at its beginning; the stack closes it."""
+        content = stack.enter_context(self._open())
+        if not self._toc:
+            unpacked = stack.enter_context(gzip.GzipFile(fileobj=content))
+            _skip(unpacked, _HEADER.size + self.header.count * sum(self.header.widths[:number]))
+            return unpacked
+        start, length = self._toc[number]
+        content.seek(start)
+        part = cast("IO[bytes]", _Part(content, length))
+        reader = zstandard.ZstdDecompressor().stream_reader(part, closefd=False)
+        return stack.enter_context(reader)
+
+    def _read_gzip_header(self, handle: BinaryFile) -> SpzHeader:
+        with gzip.open(handle) as unpacked:
+            magic, version, count, degree, bits, flags, _ = _HEADER.unpack(unpacked.read(_HEADER.size))
+        if magic != MAGIC:
+            raise SceneFileError(f"{self.path}: is gzip, but holds no SPZ.")
+        if version not in VERSIONS[:2]:
+            raise SceneFileError(f"{self.path}: is SPZ version {version}; versions 2, 3 and 4 are read.")
+        header = self._checked_header(version, count, degree, bits, flags)
+        if count * sum(header.widths) > _GZIP_RATIO * self._size:
+            raise _truncated_error(self.path, count)
+        return header
+
+    def _read_contents(self, handle: BinaryFile) -> SpzHeader:
+        start = handle.read(_HEADER_V4.size)
+        _, version, count, degree, bits, flags, stream_count, contents = _HEADER_V4.unpack(start)
+        if version != VERSIONS[-1]:
+            raise SceneFileError(f"{self.path}: is SPZ version {version}; versions 2, 3 and 4 are read.")
+        header = self._checked_header(version, count, degree, bits, flags)
+        if stream_count < sum(width > 0 for width in header.widths):
+            raise SceneFileError(f"{self.path}: is damaged; it has only {stream_count} of its attributes.")
+        handle.seek(contents)
+        offset = contents + stream_count * _TOC_ENTRY.size
+        for number, width in enumerate(header.widths):
+            size, full_size = (0, 0)
+            if number < stream_count:
+                size, full_size = _TOC_ENTRY.unpack(handle.read(_TOC_ENTRY.size))
+            if full_size != count * width:
+                raise SceneFileError(
+                    f"{self.path}: is damaged; attribute {number} does not have {count} items."
+                )
+            if offset + size > self._size or full_size > _ZSTD_RATIO * max(1, size):
+                raise _truncated_error(self.path, count)
+            self._toc.append((offset, size))
+            offset += size
+        return header
+
+    def _checked_header(self, version: int, count: int, degree: int, bits: int, flags: int) -> SpzHeader:
+        if degree > MAX_DEGREE:
+            raise SceneFileError(f"{self.path}: is damaged; it claims harmonics of degree {degree}.")
+        return SpzHeader(version, count, degree, bits, flags)
+
+
+class _Part:
+    """So many bytes of a file from where it is."""
+
+    def __init__(self, handle: BinaryFile, length: int) -> None:
+        self._handle = handle
+        self._left = length
+
+    def read(self, size: int = -1) -> bytes:
+        wanted = self._left if size < 0 else min(size, self._left)
+        found = self._handle.read(wanted)
+        self._left -= len(found)
+        return found
+
+
+def open_spz(path: Path) -> SpzSource:
+    """Open a file.
 
     Raises:
-        SceneFileError: the file is no SPZ, is damaged, or is of an unknown version.
+        SceneFileError: the file cannot be read, is no SPZ, is damaged, or is of an unknown version.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise SceneFileError(f"{path}: is damaged or cannot be read ({error}).") from error
-    return parse_spz(path, data)
+    with _name_errors(path):
+        size = path.stat().st_size
+    return SpzSource(path, lambda: path.open("rb"), size)
 
 
-def parse_spz(path: Path, data: bytes) -> SpzFile:
-    """Decompress the content of a file.
+def parse_spz(path: Path, data: bytes) -> SpzSource:
+    """Open the content of a file.
 
     Args:
         path: file that it is from, for errors.
@@ -79,97 +223,67 @@ def parse_spz(path: Path, data: bytes) -> SpzFile:
     Raises:
         SceneFileError: it is no SPZ, is damaged, or is of an unknown version.
     """
+    return SpzSource(path, lambda: io.BytesIO(data), len(data))
+
+
+@contextlib.contextmanager
+def _name_errors(path: Path) -> Iterator[None]:
     try:
-        if data.startswith(MAGIC):
-            return _read_v4(path, data)
-        if data.startswith(GZIP_MAGIC):
-            return _read_gzip(path, data)
+        yield
     except (OSError, EOFError, zlib.error, zstandard.ZstdError, struct.error) as error:
         raise SceneFileError(f"{path}: is damaged or cannot be read ({error}).") from error
-    raise SceneFileError(f"{path}: is no SPZ file.")
 
 
-def _read_gzip(path: Path, data: bytes) -> SpzFile:
-    with gzip.open(io.BytesIO(data)) as handle:
-        magic, version, count, degree, bits, flags, _ = _HEADER.unpack(handle.read(_HEADER.size))
-        if magic != MAGIC:
-            raise SceneFileError(f"{path}: is gzip, but holds no SPZ.")
-        if version not in VERSIONS[:2]:
-            raise SceneFileError(f"{path}: is SPZ version {version}; versions 2, 3 and 4 are read.")
-        widths = _checked_widths(path, version, degree)
-        if count * sum(widths) > _GZIP_RATIO * len(data):
-            raise _truncated_error(path, count)
-        streams = tuple(handle.read(count * width) for width in widths)
-        handle.read(_MAX_EXTENSIONS)  # the end of the stream is where its checksum is looked at
-    if any(len(stream) < count * width for stream, width in zip(streams, widths, strict=True)):
-        raise _truncated_error(path, count)
-    return SpzFile(
-        version=version, count=count, sh_degree=degree, fractional_bits=bits, flags=flags, streams=streams
-    )
-
-
-def _read_v4(path: Path, data: bytes) -> SpzFile:
-    _, version, count, degree, bits, flags, stream_count, contents = _HEADER_V4.unpack_from(data)
-    if version != VERSIONS[-1]:
-        raise SceneFileError(f"{path}: is SPZ version {version}; versions 2, 3 and 4 are read.")
-    widths = _checked_widths(path, version, degree)
-    if stream_count < sum(width > 0 for width in widths):
-        raise SceneFileError(f"{path}: is damaged; it has only {stream_count} of its attributes.")
-    offset = contents + stream_count * _TOC_ENTRY.size
-    streams = []
-    for number, width in enumerate(widths):
-        size, full_size = (0, 0)
-        if number < stream_count:
-            size, full_size = _TOC_ENTRY.unpack_from(data, contents + number * _TOC_ENTRY.size)
-        if full_size != count * width:
-            raise SceneFileError(f"{path}: is damaged; attribute {number} does not have {count} items.")
-        if offset + size > len(data) or full_size > _ZSTD_RATIO * max(1, size):
-            raise _truncated_error(path, count)
-        packed = data[offset : offset + size]
-        reader = zstandard.ZstdDecompressor().stream_reader(packed)
-        streams.append(reader.read(full_size) if full_size else b"")
-        if len(streams[-1]) < full_size:
-            raise _truncated_error(path, count)
-        offset += size
-    return SpzFile(
-        version=version,
-        count=count,
-        sh_degree=degree,
-        fractional_bits=bits,
-        flags=flags,
-        streams=tuple(streams),
-    )
-
-
-def _checked_widths(path: Path, version: int, degree: int) -> tuple[int, ...]:
-    if degree > MAX_DEGREE:
-        raise SceneFileError(f"{path}: is damaged; it claims harmonics of degree {degree}.")
-    return stream_widths(version, degree)
+def _skip(handle: gzip.GzipFile, length: int) -> None:
+    """Read on by so many bytes, or to the end; seek() would do it in small steps."""
+    while length > 0 and (found := len(handle.read(min(length, _SKIPPED_BYTES)))):
+        length -= found
 
 
 def _truncated_error(path: Path, count: int) -> SceneFileError:
     return SceneFileError(f"{path}: is truncated; not all of its {count} Gaussians are there.")
 
 
-def pack_spz(file: SpzFile) -> bytes:
-    """Return the content of a file: gzip for version 3, Zstandard for version 4."""
-    if file.version == VERSIONS[-1]:
-        return _pack_v4(file)
-    packed = io.BytesIO()
-    header = (file.version, file.count, file.sh_degree, file.fractional_bits, file.flags, 0)
+def write_spz(content: SpzContent, handle: BinaryFile) -> None:
+    """Write a file, piece by piece: gzip for version 3, Zstandard for version 4.
+
+    Args:
+        content: what to write.
+        handle: an empty file; it can be gone back in.
+    """
+    header = content.header
+    if header.version == VERSIONS[-1]:
+        _write_v4(content, handle)
+        return
+    fields = (header.version, header.count, header.sh_degree, header.fractional_bits, header.flags, 0)
     # Without the time, equal scenes give equal files.
-    with gzip.GzipFile("", "wb", GZIP_LEVEL, packed, mtime=0) as handle:
-        handle.write(_HEADER.pack(MAGIC, *header))
-        for stream in file.streams:
-            handle.write(stream)
-    return packed.getvalue()
+    with gzip.GzipFile("", "wb", GZIP_LEVEL, handle, mtime=0) as packed:  # type: ignore[arg-type]
+        packed.write(_HEADER.pack(MAGIC, *fields))
+        for stream in content.streams:
+            for piece in stream:
+                packed.write(piece)
 
 
-def _pack_v4(file: SpzFile) -> bytes:
-    streams = [stream for stream in file.streams if stream]
-    packed = [zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(stream) for stream in streams]
-    header = (file.version, file.count, file.sh_degree, file.fractional_bits, file.flags, len(packed))
-    contents = [
-        _TOC_ENTRY.pack(len(small), len(stream)) for small, stream in zip(packed, streams, strict=True)
-    ]
-    return b"".join([_HEADER_V4.pack(MAGIC, *header, _HEADER_V4.size), *contents, *packed])
+def _write_v4(content: SpzContent, handle: BinaryFile) -> None:
+    header = content.header
+    present = [stream for stream, width in zip(content.streams, header.widths, strict=True) if width]
+    fields = (header.version, header.count, header.sh_degree, header.fractional_bits, header.flags)
+    start = _HEADER_V4.pack(MAGIC, *fields, len(present), _HEADER_V4.size)
+    handle.write(start + bytes(len(present) * _TOC_ENTRY.size))
+    sizes = []
+    for stream in present:
+        # Zstandard makes other bytes of a stream in pieces, so that it is put on disk, and mapped.
+        with tempfile.TemporaryFile() as spool:
+            for piece in stream:
+                spool.write(piece)
+            spool.flush()
+            length = spool.tell()
+            with (
+                mmap.mmap(spool.fileno(), length, access=mmap.ACCESS_READ) as mapped,
+                memoryview(mapped) as whole,
+            ):
+                packed = zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(whole)
+        handle.write(packed)
+        sizes.append(_TOC_ENTRY.pack(len(packed), length))
+    handle.seek(len(start))
+    handle.write(b"".join(sizes))

@@ -5,22 +5,25 @@ axis; the scale along it has no meaning and is the flat 1e-5. The data are turne
 usd-core (the extra ``usd``).
 """
 
+import shutil
 import tempfile
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float32
 
 from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.core.local_origin import is_set
 from octasplat.engine.core.writing import atomic_replace
-from octasplat.engine.files.encodings import half_turn_gaussians, unit_quats
+from octasplat.engine.files.encodings import half_turn_points, half_turn_quats, half_turn_sh, unit_quats
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.registry import Exporter, register
-from octasplat.engine.files.splat_rows import check_scales, select_for_export
+from octasplat.engine.files.splat_rows import check_scales, iterate_blocks, select_for_export
 from octasplat.engine.files.usd_stage import ROOT, import_usd, missing_usd, place_in_georeference
+from octasplat.engine.files.usdz_surface import MAX_BYTES
 from octasplat.engine.gaussians.flattening import rotate_axis_to_first
 from octasplat.engine.gaussians.model import FLAT_SCALE, FlatGaussians
 from octasplat.engine.gaussians.scene_metadata import SceneMetadata
@@ -42,10 +45,11 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     """Write ``.usda`` (text), ``.usd`` or ``.usdc`` (binary), or ``.usdz`` (a package).
 
     Raises:
-        SceneFileError: usd-core is missing or too old, nothing to write, or values that are not finite.
+        SceneFileError: usd-core is missing or too old, nothing to write, values that are not finite, or more
+            than the 2 GB that a package can hold.
         OSError: the file cannot be written.
     """
-    scene = half_turn_gaussians(select_for_export(gaussians, path, options))
+    scene = select_for_export(gaussians, path, options)
     check_scales(scene, path)
     pxr = _import_usd(path)
     suffix = ".usdc" if path.suffix.lower() in (".usdz", ".usd") else path.suffix.lower()
@@ -53,11 +57,16 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
         layer = Path(folder) / f"scene{suffix}"
         _write_stage(pxr, scene, layer, options.facts)
         if path.suffix.lower() == ".usdz":
+            if (size := layer.stat().st_size) > MAX_BYTES:
+                raise SceneFileError(
+                    f"{path}: not written; {len(scene):,} Gaussians need {size:,} bytes, and a USDZ of ours "
+                    f"holds at most {MAX_BYTES:,}. Name a .usdc, or leave faint ones out with min_opacity."
+                )
             package = Path(folder) / "scene.usdz"
             if not pxr["UsdUtils"].CreateNewUsdzPackage(pxr["Sdf"].AssetPath(str(layer)), str(package)):
                 raise SceneFileError(f"{path}: not written; usd-core could not make the package.")
             layer = package
-        temporary.write_bytes(layer.read_bytes())
+        shutil.copyfile(layer, temporary)
     return (path,)
 
 
@@ -66,6 +75,13 @@ def _import_usd(path: Path) -> dict[str, ModuleType]:
     if not hasattr(pxr["UsdVol"], "ParticleField"):
         raise SceneFileError(f"{path}: this usd-core has no ParticleField; install usd-core 26.5 or later.")
     return pxr
+
+
+def _packed_orientations(scene: FlatGaussians) -> Float32[np.ndarray, "n 4"]:
+    """Return rotations turned to y up, with the normal as the last axis, as usd-core has them in memory."""
+    axis_z = np.ones(len(scene), dtype=np.int64)  # the columns of R become r2, r3, r1
+    quats = unit_quats(rotate_axis_to_first(half_turn_quats(scene.quats_wxyz), axis_z))
+    return np.asarray(quats.astype(np.float32)[:, [1, 2, 3, 0]])  # x, y, z, w
 
 
 def _write_stage(pxr: dict[str, ModuleType], scene: FlatGaussians, layer: Path, facts: SceneMetadata) -> None:
@@ -92,19 +108,21 @@ def _write_stage(pxr: dict[str, ModuleType], scene: FlatGaussians, layer: Path, 
     def attribute(name: str, values: Any) -> None:
         prim.GetAttribute(name).Set(values)
 
-    axis_z = np.ones(len(scene), dtype=np.int64)  # the columns of R become r2, r3, r1
-    quats = unit_quats(rotate_axis_to_first(scene.quats_wxyz, axis_z)).astype(np.float32)
+    # Each is turned to y up by itself, so that the scene is not in memory twice.
+    means = half_turn_points(scene.means_world)
+    attribute("positions", vt.Vec3fArray.FromNumpy(means))
+    quats = np.concatenate([_packed_orientations(block) for block in iterate_blocks(scene)])
+    attribute("orientations", vt.QuatfArray.FromNumpy(quats))
+    del quats
     scales = np.concatenate([scene.scales, np.full((len(scene), 1), FLAT_SCALE, np.float32)], axis=1)
-    attribute("positions", vt.Vec3fArray.FromNumpy(np.ascontiguousarray(scene.means_world)))
-    # usd-core keeps quaternions in memory as x, y, z, w.
-    attribute("orientations", vt.QuatfArray.FromNumpy(np.ascontiguousarray(quats[:, [1, 2, 3, 0]])))
     attribute("scales", vt.Vec3fArray.FromNumpy(scales))
     attribute("opacities", vt.FloatArray.FromNumpy(scene.opacities))
     attribute("radiance:sphericalHarmonicsDegree", scene.sh_degree)
-    flat_sh = np.ascontiguousarray(scene.sh.reshape(-1, 3))
+    flat_sh = half_turn_sh(scene.sh).reshape(-1, 3)
     attribute("radiance:sphericalHarmonicsCoefficients", vt.Vec3fArray.FromNumpy(flat_sh))
-    reach = EXTENT_SIGMAS * scene.scales.max(axis=1, keepdims=True)
-    extent = np.stack([(scene.means_world - reach).min(axis=0), (scene.means_world + reach).max(axis=0)])
+    del flat_sh
+    reach = EXTENT_SIGMAS * scales[:, :2].max(axis=1, keepdims=True)
+    extent = np.stack([(means - reach).min(axis=0), (means + reach).max(axis=0)])
     attribute("extent", vt.Vec3fArray.FromNumpy(extent.astype(np.float32)))
     # For programs that know no particle fields, and show colored points
     fallback = geom.Gprim(prim)

@@ -1,5 +1,7 @@
 """Flattening of three-dimensional Gaussians of other programs, and its losses."""
 
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -10,7 +12,13 @@ from jaxtyping import Bool, Float32, Int
 from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.gaussians.channels import Channels, check_row_count
 from octasplat.engine.gaussians.model import FLAT_SCALE, FlatGaussians
-from octasplat.engine.gaussians.rows import select_rows
+from octasplat.engine.gaussians.rows import (
+    RowIndex,
+    allocate_rows,
+    overwrite_rows,
+    select_rows,
+    view_rows,
+)
 
 FLAT_LOG_SCALE = np.float32(np.log(FLAT_SCALE))
 LOG_SCALE_TOLERANCE = np.float32(1e-5)
@@ -19,6 +27,8 @@ MAX_LOGIT = np.float32(16.0)
 """Stands for an infinite logit, which converters write for opacity 1; its sigmoid is 1 - 1e-7."""
 MAX_THICKNESS_RATIO = 0.5
 """Gaussians whose thickness is more than this share of their next extent are no surfaces."""
+ROWS_PER_BLOCK = 16384
+"""Gaussians that are dealt with at a time, some megabytes of them."""
 _CYCLIC_ROTATIONS = np.array([[1, 0, 0, 0], [0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5]], dtype=np.float32)
 """Quaternions of P_k, whose columns are the axes k, k+1, k+2 (mod 3): they turn axis k into the first."""
 
@@ -57,6 +67,19 @@ class GaussianCloud:
 
 
 @dataclass(frozen=True)
+class CloudBlocks:
+    """The Gaussians of a file, some thousands at a time, so that a file need not be in memory.
+
+    Attributes:
+        count: of all together.
+        blocks: Gaussians and their rows among all; may be gone through once.
+    """
+
+    count: int
+    blocks: Iterable[tuple[RowIndex, GaussianCloud]]
+
+
+@dataclass(frozen=True)
 class ImportReport:
     """Counts of what reading a file of Gaussians found and dropped.
 
@@ -86,16 +109,46 @@ class ImportReport:
     notes: tuple[str, ...] = ()
 
 
+def row_slices(count: int, rows_per_block: int = ROWS_PER_BLOCK) -> Iterator[slice]:
+    """Yield the rows of all blocks, in order."""
+    for start in range(0, count, rows_per_block):
+        yield slice(start, min(start + rows_per_block, count))
+
+
+def split_cloud(cloud: GaussianCloud) -> CloudBlocks:
+    """Return a cloud that is in memory some thousand Gaussians at a time, not copied."""
+    count = len(cloud.means_world)
+    return CloudBlocks(count, ((rows, view_rows(cloud, rows)) for rows in row_slices(count)))
+
+
+def join_blocks(source: CloudBlocks, path: Path) -> GaussianCloud:
+    """Return all Gaussians of a file as it has them.
+
+    Raises:
+        SceneFileError: there are none; it names ``path``.
+    """
+    joined: GaussianCloud | None = None
+    notes: dict[str, None] = {}  # each once, in order
+    for rows, cloud in source.blocks:
+        if joined is None:
+            joined = allocate_rows(cloud, source.count)
+        overwrite_rows(joined, rows, cloud)
+        notes.update(dict.fromkeys(cloud.notes))
+    if joined is None:
+        raise SceneFileError(f"{path}: holds no Gaussians.")
+    return replace(joined, notes=tuple(notes))
+
+
 def flatten(
-    cloud: GaussianCloud, path: Path, *, drop_invalid: bool = False
+    source: GaussianCloud | CloudBlocks, path: Path, *, drop_invalid: bool = False
 ) -> tuple[FlatGaussians, ImportReport]:
-    """Flatten each Gaussian along its smallest axis, or along ``cloud.normal_axis``.
+    """Flatten each Gaussian along its smallest axis, or along ``normal_axis``, some thousands at a time.
 
     The axes are relabelled, which changes neither the directions of the other two nor their scales. Gaussians
     that have our own flat scale on axis 0 come out bit for bit.
 
     Args:
-        cloud: what a file holds.
+        source: what a file holds.
         path: names the file in errors.
         drop_invalid: leave out Gaussians with values that are not finite, instead of refusing the file.
 
@@ -103,15 +156,59 @@ def flatten(
         SceneFileError: there are no Gaussians, or some hold values that are not finite or rotations of length
             zero.
     """
-    total = len(cloud.means_world)
-    if total == 0:
+    if isinstance(source, GaussianCloud):
+        source = split_cloud(source)
+    if source.count == 0:
         raise SceneFileError(f"{path}: holds no Gaussians.")
+    scene: FlatGaussians | None = None
+    kept = np.zeros(source.count, bool)
+    invalid: Counter[str] = Counter()
+    notes: dict[str, None] = {}  # each once, in order
+    thickness: list[np.ndarray] = []
+    saturated, scale_count = 0, 2
+    for rows, cloud in source.blocks:
+        valid, found = _valid_mask(cloud)
+        invalid.update(found)
+        notes.update(dict.fromkeys(cloud.notes))
+        scale_count = cloud.log_scales.shape[1]
+        if found:
+            if not drop_invalid:
+                continue  # the rest is only looked at, for how many there are
+            numbers = np.arange(*rows.indices(source.count)) if isinstance(rows, slice) else rows
+            rows = numbers[valid]
+            cloud = select_rows(cloud, valid)
+        block, ratios = _flatten_block(cloud)
+        if scene is None:
+            scene = allocate_rows(block, source.count)
+        scene.put(rows, block)
+        kept[rows] = True
+        thickness.append(ratios)
+        saturated += int(np.isinf(cloud.opacity_logits).sum())
+    if invalid and not drop_invalid:
+        raise _invalid_error(path, invalid, source.count)
+    if scene is None or not kept.any():
+        raise SceneFileError(f"{path}: none of its {source.count} Gaussians has finite values only.")
+    gaussians = scene if kept.all() else scene.select(kept)
+    ratios = np.concatenate(thickness)
+    report = ImportReport(
+        count=len(gaussians),
+        sh_degree=gaussians.sh_degree,
+        scale_count=scale_count,
+        flattened=len(ratios),
+        median_thickness=float(np.median(ratios)) if len(ratios) else 0.0,
+        max_thickness=float(ratios.max()) if len(ratios) else 0.0,
+        saturated=saturated,
+        thick=int((ratios > MAX_THICKNESS_RATIO).sum()),
+        dropped=source.count - len(gaussians),
+        notes=tuple(notes),
+    )
+    return gaussians, report
+
+
+def _flatten_block(cloud: GaussianCloud) -> tuple[FlatGaussians, Float32[np.ndarray, " m"]]:
+    """Return valid Gaussians flattened, and the thickness ratio of those that were not flat already."""
     infinite = np.isinf(cloud.opacity_logits)
     logits = np.where(infinite, np.copysign(MAX_LOGIT, cloud.opacity_logits), cloud.opacity_logits)
-    cloud = replace(cloud, opacity_logits=logits.astype(np.float32))
-    valid = _valid_mask(cloud, path, drop_invalid)
-    if not valid.all():
-        cloud = select_rows(cloud, valid)
     scale_count = cloud.log_scales.shape[1]
     if scale_count == 3 and cloud.normal_axis is None:
         quats, in_plane, thickness = _flatten_smallest_axis(
@@ -127,57 +224,43 @@ def flatten(
         means_world=cloud.means_world,
         quats_wxyz=quats,
         log_scales=in_plane,
-        opacity_logits=cloud.opacity_logits,
+        opacity_logits=logits.astype(np.float32),
         sh=cloud.sh,
         channels=cloud.channels,
     )
-    report = ImportReport(
-        count=len(gaussians),
-        sh_degree=gaussians.sh_degree,
-        scale_count=scale_count,
-        flattened=len(thickness),
-        median_thickness=float(np.median(thickness)) if len(thickness) else 0.0,
-        max_thickness=float(thickness.max()) if len(thickness) else 0.0,
-        saturated=int(infinite[valid].sum()),
-        thick=int((thickness > MAX_THICKNESS_RATIO).sum()),
-        dropped=total - len(gaussians),
-        notes=cloud.notes,
-    )
-    return gaussians, report
+    return gaussians, thickness
 
 
-def _valid_mask(cloud: GaussianCloud, path: Path, drop_invalid: bool) -> Bool[np.ndarray, " n"]:
-    """Return which Gaussians are valid; raises for the others unless they may be dropped."""
+_NO_LENGTH = "a rotation of length zero"
+
+
+def _valid_mask(cloud: GaussianCloud) -> tuple[Bool[np.ndarray, " n"], dict[str, int]]:
+    """Return which Gaussians are valid, and how many are not for each reason that there is."""
     scales = cloud.log_scales
     ordered = np.sort(scales, axis=1)  # not-a-number comes last
     # A normal may be infinitely thin; nothing else may be infinite.
     bad_scale = ~np.isfinite(ordered[:, -2:]).all(axis=1) | np.isnan(scales).any(axis=1)
     bad = {
-        "position": ~np.isfinite(cloud.means_world).all(axis=1),
-        "rotation": ~np.isfinite(cloud.quats_wxyz).all(axis=1),
-        "scale": bad_scale,
-        "opacity": ~np.isfinite(cloud.opacity_logits),
-        "color": ~np.isfinite(cloud.sh).all(axis=(1, 2)),
-        **{name: ~np.isfinite(array).all(axis=1) for name, array in cloud.channels.items()},
+        "no finite position": ~np.isfinite(cloud.means_world).all(axis=1),
+        "no finite rotation": ~np.isfinite(cloud.quats_wxyz).all(axis=1),
+        "no finite scale": bad_scale,
+        # An infinite one stands for an opacity of 0 or 1.
+        "no finite opacity": np.isnan(cloud.opacity_logits),
+        "no finite color": ~np.isfinite(cloud.sh).all(axis=(1, 2)),
+        **{f"no finite {name}": ~np.isfinite(a).all(axis=1) for name, a in cloud.channels.items()},
+        _NO_LENGTH: (cloud.quats_wxyz == 0).all(axis=1),
     }
-    no_length = (cloud.quats_wxyz == 0).all(axis=1)
-    valid: Bool[np.ndarray, " n"] = ~np.logical_or.reduce([*bad.values(), no_length])
-    if drop_invalid:
-        if not valid.any():
-            raise SceneFileError(f"{path}: none of its {len(valid)} Gaussians has finite values only.")
-        return valid
+    valid: Bool[np.ndarray, " n"] = ~np.logical_or.reduce(list(bad.values()))
+    return valid, {reason: int(mask.sum()) for reason, mask in bad.items() if mask.any()}
+
+
+def _invalid_error(path: Path, invalid: Counter[str], count: int) -> SceneFileError:
+    """Return the error for the first reason in the order of the parameters, rotations without length last."""
+    order = ("position", "rotation", "scale", "opacity", "color")
+    first = [reason for name in order if (reason := f"no finite {name}") in invalid]
+    reason = [*first, *(reason for reason in invalid if reason != _NO_LENGTH), _NO_LENGTH][0]
     advice = "octasplat import --drop-invalid leaves them out"
-    for what, mask in bad.items():
-        if mask.any():
-            raise SceneFileError(
-                f"{path}: {mask.sum()} of {len(mask)} Gaussians have no finite {what}; {advice}."
-            )
-    if no_length.any():
-        raise SceneFileError(
-            f"{path}: {no_length.sum()} of {len(no_length)} Gaussians have a rotation of length zero; "
-            f"{advice}."
-        )
-    return valid
+    return SceneFileError(f"{path}: {invalid[reason]} of {count} Gaussians have {reason}; {advice}.")
 
 
 def _flatten_smallest_axis(

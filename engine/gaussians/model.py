@@ -15,6 +15,7 @@ from octasplat.engine.gaussians.rows import (
     overwrite_rows,
     row_arrays,
     select_rows,
+    view_rows,
 )
 
 FLAT_SCALE = 1e-5
@@ -22,6 +23,10 @@ FLAT_SCALE = 1e-5
 
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic."""
+
+
+_CHECKED_ROWS = 1 << 16
+"""At a time, as what is made of a block stays in the cache."""
 
 
 @dataclass
@@ -85,7 +90,7 @@ class FlatGaussians:
 
     def view(self, part: slice) -> "FlatGaussians":
         """Return the Gaussians of a slice, not copied."""
-        return map_rows(self, lambda array: array[part])
+        return view_rows(self, part)
 
     def put(self, index: RowIndex, others: "FlatGaussians") -> None:
         """Overwrite the Gaussians at ``index`` by ``others``, in place."""
@@ -117,7 +122,11 @@ class FlatGaussians:
 
     def is_finite(self) -> bool:
         """Return whether every parameter is a finite number."""
-        return all(bool(np.isfinite(array).all()) for array in row_arrays(self).values())
+        return all(
+            bool(np.isfinite(array[start : start + _CHECKED_ROWS]).all())
+            for array in row_arrays(self).values()
+            for start in range(0, len(array), _CHECKED_ROWS)
+        )
 
 
 def concatenate(parts: list[FlatGaussians]) -> FlatGaussians:

@@ -67,6 +67,16 @@ def select_rows(table: TableT, index: RowIndex) -> TableT:
     return map_rows(table, lambda array: array[index].copy())
 
 
+def allocate_rows(table: TableT, count: int) -> TableT:
+    """Return a table with the columns of another and so many rows, not filled yet."""
+    return map_rows(table, lambda array: np.empty((count, *array.shape[1:]), array.dtype))
+
+
+def view_rows(table: TableT, part: slice) -> TableT:
+    """Return the rows of a slice, not copied."""
+    return map_rows(table, lambda array: array[part])
+
+
 def overwrite_rows(table: RowTable, index: RowIndex, other: RowTable) -> None:
     """Overwrite the rows at ``index`` by all rows of ``other``, in place.
 

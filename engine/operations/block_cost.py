@@ -28,6 +28,7 @@ from octasplat.engine.operations.cost_model import (
     gaussians_within,
     held_out_count,
     model_bytes,
+    ray_cost_growth,
     training_pixels,
 )
 from octasplat.engine.train.config import max_gaussian_count
@@ -89,6 +90,7 @@ def estimate_blocks(
         update={"train": coarse_settings(config.train), "max_side": coarse_side_px(longest)}
     )
     coarse = estimate_reconstruction(smaller, photographs, cores)
+    coarse_count = max_gaussian_count(smaller.train, training_pixels(config, photographs))
     # Blocks that are alike, as thousands of an even guess, are reckoned once.
     total_count = sum(sizes.count for sizes in photographs)
     found = {
@@ -96,11 +98,35 @@ def estimate_blocks(
         for block in dict.fromkeys(shares)
     }
     costs, counts = zip(*(found[block] for block in shares), strict=True)
-    block_seconds = [cost.stage_seconds["train"] for cost in costs]
     block_bytes = [cost.memory_bytes for cost in costs]
-    last_seconds = POLISH_FRACTION * max(block_seconds)
+    # A block's rays meet the coarse Gaussians around it, and the last piece's those of all blocks.
+    alone = [cost.stage_seconds["train"] for cost in costs]
+    merged_count = round(sum(counts) / max(1.0, sum(block.share for block in shares)))
+    block_seconds, last_pieces = (
+        [
+            seconds * ray_cost_growth(config.train, count, max(count, seen))
+            for seconds, count, seen in zip(alone, counts, all_seen, strict=True)
+        ]
+        for all_seen in (
+            [
+                count + round((1 - block.share) * coarse_count)
+                for count, block in zip(counts, shares, strict=True)
+            ],
+            [merged_count] * len(shares),
+        )
+    )
+    costs = tuple(
+        cost.model_copy(
+            update={
+                "seconds": round(cost.seconds + seconds - before, 1),
+                "stage_seconds": {**cost.stage_seconds, "train": round(seconds, 1)},
+            }
+        )
+        for cost, seconds, before in zip(costs, block_seconds, alone, strict=True)
+    )
+    last_seconds = POLISH_FRACTION * max(last_pieces)
     if fits_together(config.train, counts, [block.share for block in shares], most_gaussians):
-        last_seconds = FINISH_FRACTION * sum(block_seconds)
+        last_seconds = FINISH_FRACTION * sum(last_pieces)
         block_bytes.append(whole.memory_bytes)
     extra = coarse.stage_seconds["train"] + last_seconds
     longer = extra + sum(block_seconds) - whole.stage_seconds["train"]

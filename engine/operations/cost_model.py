@@ -333,6 +333,11 @@ def _expected_gaussians(train: TrainConfig, trained_on: int) -> int:
     return min(most, _PAPER_GAUSSIANS) if train.densify.kind == "redisplats" else most
 
 
+def ray_cost_growth(train: TrainConfig, gaussians: int, seen: int) -> float:
+    """Return how many times as long a ray takes where it meets ``seen`` Gaussians and not ``gaussians``."""
+    return _ray_cpu_seconds(train, max(seen, 1)) / _ray_cpu_seconds(train, max(gaussians, 1))
+
+
 def _ray_cpu_seconds(train: TrainConfig, gaussians: int) -> float:
     if train.ray_patch_rays == 1:
         return _SINGLE_RAY_CPU_SECONDS

@@ -4,11 +4,11 @@ import uuid
 
 from octasplat.service.actions.access import check_searchable_name, fetch_visible_job, read_job
 from octasplat.service.auth import Principal
+from octasplat.service.live_scene_file import build_live_scene
 from octasplat.service.problems import not_found_error
 from octasplat.service.state import Service
 from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
-from octasplat.workers.db.live_scenes import LiveScene
-from octasplat.workers.db.live_scenes import get_live_scene as read_live_scene
+from octasplat.workers.db.live_scenes import ShownScene, get_shown_scene
 from octasplat.workers.db.rows import Artifact, Job
 from octasplat.workers.queue import jobs as rows
 from octasplat.workers.storage.protocol import Blob
@@ -73,25 +73,27 @@ async def get_preview(service: Service, principal: Principal, job_id: uuid.UUID)
     return await run_in_pool(ThreadPurpose.DOWNLOADS, service.storage.stat, job.preview["sha256"])
 
 
-async def find_live_scene(service: Service, principal: Principal, job_id: uuid.UUID) -> LiveScene | None:
-    """Return the newest state of a job's training; None if there is none.
+async def find_live_scene(service: Service, principal: Principal, job_id: uuid.UUID) -> ShownScene | None:
+    """Return what is shown of a job's training; None if there is nothing.
 
     Raises:
         ProblemError: 404 if the job does not exist or the principal may not see it.
     """
     async with service.pool.connection() as connection:
         await fetch_visible_job(connection, principal, job_id)
-        return await read_live_scene(connection, job_id)
+        return await get_shown_scene(connection, job_id)
 
 
-async def get_live_scene(service: Service, principal: Principal, job_id: uuid.UUID) -> Blob:
-    """Return the newest state of a job's training, a PLY file.
+async def get_live_scene(service: Service, principal: Principal, job_id: uuid.UUID) -> Blob | bytes:
+    """Return the newest state of a job's training, a PLY file; with trained blocks in it, its content.
 
     Raises:
         ProblemError: 404 if it does not exist or the principal may not see it.
         StorageError: the store does not have it.
     """
-    scene = await find_live_scene(service, principal, job_id)
-    if scene is None:
+    shown = await find_live_scene(service, principal, job_id)
+    if shown is None:
         raise not_found_error("state of its training")
-    return await run_in_pool(ThreadPurpose.DOWNLOADS, service.storage.stat, scene.sha256)
+    if shown.blocks:
+        return await run_in_pool(ThreadPurpose.DOWNLOADS, build_live_scene, service.storage, shown)
+    return await run_in_pool(ThreadPurpose.DOWNLOADS, service.storage.stat, shown.scene.sha256)

@@ -93,9 +93,11 @@ async def run_import(service: Service, task: DatasetTask) -> TaskOutcome:
 async def _opened(service: Service, principal: Principal, url: str) -> AsyncIterator[httpx.Response]:
     """Open an address, over redirects that are judged as it is."""
     allowed = service.settings.import_hosts
+    location = ""
     async with guarded_client(allowed) as client:
         for _ in range(MAX_REDIRECTS + 1):
             try:
+                url = urljoin(url, location)
                 request = client.build_request(
                     "GET",
                     check_url(url, allowed, max_length=MAX_IMPORT_URL),
@@ -115,7 +117,7 @@ async def _opened(service: Service, principal: Principal, url: str) -> AsyncIter
                         raise _import_error(f"The address answered {answer.status_code}.")
                     yield answer
                     return
-                url = urljoin(url, answer.headers["location"])
+                location = answer.headers["location"]
             finally:
                 await answer.aclose()
     raise _import_error(f"The address is redirected more than {MAX_REDIRECTS} times.")

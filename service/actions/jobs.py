@@ -83,6 +83,9 @@ async def list_jobs(
         job_filter: which of them.
         before: that come behind this one.
         limit: at most so many.
+
+    Raises:
+        ProblemError: 422 if the order begins behind a job that there is no more.
     """
     async with service.pool.connection() as connection:
         found = await rows.list_jobs(
@@ -97,6 +100,12 @@ async def list_jobs(
             order=job_filter.order,
             limit=limit + 1,
         )
+        if not found and before is not None and job_filter.order not in ("newest", "oldest"):
+            last = await rows.get_job(connection, before)
+            if last is None or not principal.may_see(last.owner):
+                raise ProblemError(
+                    422, "cursor", "The job behind which this part of the list begins is gone; begin again."
+                )
         waiting = [job.id for job in found if job.waits_for_blocks]
         blocks = await blocks_of(connection, waiting)
     found = [

@@ -70,7 +70,7 @@ def read_records(file: BinaryIO, *, max_entries: int, max_directory_bytes: int) 
         IntakeError: with a code that begins with ``archive-`` or ``name-``.
     """
     entries, directory_start = _read_directory(file, max_entries, max_directory_bytes)
-    records = [_with_local_header(file, *entry) for entry in entries]
+    records = [_with_local_header(file, *entry, directory_start) for entry in entries]
     # In the order of their data, in which gaps and overlaps show.
     records.sort(key=lambda record: record.header_start)
     _check_coverage(file, records, directory_start)
@@ -172,8 +172,9 @@ def _central_entries(directory: bytes, count: int) -> list[tuple[ZipEntry, bytes
     return entries
 
 
-def _with_local_header(file: BinaryIO, record: ZipEntry, raw_name: bytes) -> ZipEntry:
-    file.seek(record.header_start)
+def _with_local_header(file: BinaryIO, record: ZipEntry, raw_name: bytes, directory_start: int) -> ZipEntry:
+    # A start behind the entries may be one that no file has, which cannot be sought.
+    file.seek(min(record.header_start, directory_start))
     header = file.read(_LOCAL_LAYOUT.size)
     if len(header) < _LOCAL_LAYOUT.size or header[:4] != b"PK\x03\x04":
         raise_intake_error(

@@ -6,7 +6,7 @@ from fastapi import APIRouter, Path, Query, Request, Response
 
 from octasplat.service.actions import artifacts as actions
 from octasplat.service.auth import Reader
-from octasplat.service.downloads import send_archive, send_blob
+from octasplat.service.downloads import send_archive, send_blob, send_bytes
 from octasplat.service.routes import problem_responses
 from octasplat.service.routes.parameters import IfNoneMatch, IfRange, JobId, Range
 from octasplat.service.routes.response_headers import DISPOSITION, stored_content, with_headers
@@ -104,12 +104,16 @@ async def get_live_scene(
 ) -> Response:  # fmt: skip
     """Return the newest state of a training as a PLY file, decimated; the sparse points before it begins.
 
-    The event `live_scene` tells of each. There is none any more once the job has succeeded.
+    While blocks are trained it is the coarse scene, with what each block that is done has learnt in its
+    place. The event `live_scene` tells of each. There is none any more once the job has succeeded.
     """
-    blob = await actions.get_live_scene(service, principal, job_id)
-    response = await send_blob(
-        service, request, blob.sha256, blob.size_bytes,
-        media_type="application/octet-stream", name="live_scene.ply",
-    )  # fmt: skip
+    found = await actions.get_live_scene(service, principal, job_id)
+    media_type, name = "application/octet-stream", "live_scene.ply"
+    if isinstance(found, bytes):
+        response = send_bytes(request, found, media_type=media_type, name=name)
+    else:
+        response = await send_blob(
+            service, request, found.sha256, found.size_bytes, media_type=media_type, name=name
+        )
     response.headers["Cache-Control"] = "no-cache"
     return response

@@ -74,7 +74,7 @@ async def change_queue(
     return await actions.set_queue_paused(service, principal, queue, change.paused)
 
 
-@router.patch("/workers/{worker}", responses=problem_responses(404))
+@router.patch("/workers/{worker:path}", responses=problem_responses(404))
 async def change_worker(
     worker: WorkerName, change: WorkerChange, principal: Admin, service: ServiceDep
 ) -> WorkerView:

@@ -99,7 +99,7 @@ async def pause_queue(
     return redirect(request, "/admin")
 
 
-@router.post("/admin/workers/{worker}")
+@router.post("/admin/workers/{worker:path}")
 async def drain_worker(
     request: Request, worker: str, principal: Admin, service: ServiceDep, drained: bool
 ) -> Response:

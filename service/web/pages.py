@@ -48,7 +48,7 @@ from octasplat.service.web.routing import PageRoute, is_htmx_request, redirect
 from octasplat.service.web.stage_form import stage_form
 from octasplat.service.web.templating import render_page
 from octasplat.service.web.view_models import ACTIVE, job_detail, photographs_of
-from octasplat.workers.db.live_scenes import LiveScene
+from octasplat.workers.db.live_scenes import ShownScene
 from octasplat.workers.db.rows import Artifact
 from octasplat.workers.worker.job_kinds import get_job_kind, job_kinds
 
@@ -155,7 +155,8 @@ async def get_cameras(job_id: uuid.UUID, principal: Reader, service: ServiceDep)
     artifacts = await list_artifacts(service, principal, job_id)
     files = await photographs_of(service, principal, job_id)
     held_out = next((row for row in artifacts if row.name == HELD_OUT), None)
-    live = await find_live_scene(service, principal, job_id)
+    shown = await find_live_scene(service, principal, job_id)
+    live = None if shown is None else shown.scene
     content = await run_in_pool(
         ThreadPurpose.DOWNLOADS, viewer_cameras_of_job, service, artifacts, files, held_out, live
     )
@@ -283,7 +284,7 @@ def _files_field(job: JobView, unwritable: Collection[str]) -> FormField | None:
     return replace(field, default=", ".join(job.options.get("exports") or ()))
 
 
-def _live_count(live: LiveScene | None) -> str:
+def _live_count(live: ShownScene | None) -> str:
     """Return what the viewer says of the state that it shows; job.js says the same of later ones."""
     if live is None:
         return ""

@@ -260,10 +260,13 @@ async def _first_artifacts(
     """Return the first result of each job whose name fits."""
     async with connection.cursor(row_factory=class_row(Artifact)) as cursor:
         await cursor.execute(
-            """
-            SELECT DISTINCT ON (job_id) * FROM artifacts WHERE job_id = ANY(%s) AND name LIKE %s
-            ORDER BY job_id, name
-            """,
+            select_columns(
+                """
+                SELECT DISTINCT ON (job_id) {} FROM artifacts WHERE job_id = ANY(%s) AND name LIKE %s
+                ORDER BY job_id, name
+                """,
+                Artifact,
+            ),
             [ids, like],
         )
         return {row.job_id: row for row in await cursor.fetchall()}

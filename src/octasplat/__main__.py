@@ -44,19 +44,19 @@ def view(source: Path, open_page: bool | None, port: int, background: str) -> No
     """Show a scene in the browser: the folder of a run, or a file of any format.
 
     The page needs no service and no network: this command serves it, to browsers of this machine alone, until
-    Ctrl-C. Of a run, one can go from photograph to photograph.
+    Ctrl-C. Of a run, one can go from photograph to photograph. Of a run in blocks that is not done yet, it
+    shows what the blocks have learnt so far.
     """
     from octasplat.workers.cli.input_paths import check_readable
 
     check_readable(source)
-    from octasplat.scenes import read_scene
-    from octasplat.viewer import serve_scene
+    from octasplat.viewer import read_shown_scene, serve_scene
     from octasplat.workers.cli.browser import has_display
     from octasplat.workers.cli.progress import show_progress
     from octasplat.workers.cli.signals import exit_on_sigterm
 
     with show_progress() as progress:
-        scene = read_scene(source, progress)
+        scene = read_shown_scene(source, progress)
     # SIGTERM unwinds the program here too, so that the temporary file of the scene is removed.
     with exit_on_sigterm():
         try:

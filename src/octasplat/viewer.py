@@ -8,11 +8,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from octasplat.engine.core.events import EventListener
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
-from octasplat.engine.runs.run_folder import CONFIG, is_run, run_viewpoints
+from octasplat.engine.runs.run_folder import BLOCKS, CONFIG, SCENE, is_run, run_viewpoints
+from octasplat.notebook import log_event
 from octasplat.paths import PathLike
 from octasplat.runs import Run
-from octasplat.scenes import Scene, load
+from octasplat.scenes import Scene, read_scene
 from octasplat.service.web.cameras import PhotographPose, viewer_cameras
 from octasplat.service.web.scene_server import SceneServer, ViewedScene
 
@@ -70,7 +72,8 @@ def view(
     address that only browsers of this machine reach. Of a run, one can go from photograph to photograph.
 
     Args:
-        source: a scene, a file of any format, or a run.
+        source: a scene, a file of any format, or a run; of a run in blocks that is not done yet, what its
+            blocks have learnt so far.
         open_browser: open the page; else its address is all.
         port: where to serve it; 0 takes a free one.
         background: ``black`` or ``white``, to begin with.
@@ -82,12 +85,28 @@ def view(
     >>> viewer = osp.view(osp.load("scene.ply"), open_browser=False)
     >>> viewer.close()
     """
-    scene = source if isinstance(source, Scene) else load(source)
+    scene = source if isinstance(source, Scene) else read_shown_scene(Path(source), log_event)
     path = None if isinstance(source, Scene) else Path(source)
     viewer = serve_scene(scene, path, port=port, background=background)
     if open_browser:
         webbrowser.open(viewer.url)
     return viewer
+
+
+def read_shown_scene(path: Path, progress: EventListener) -> Scene:
+    """Return the scene of a file or run, or what the blocks of an unfinished run have learnt so far.
+
+    Raises:
+        SceneFileError: the file cannot be read.
+        ConfigError: a run's light cannot be read.
+        CheckpointError: what blocks have learnt cannot be read.
+    """
+    if (path / BLOCKS).is_dir() and not (path / SCENE).exists():
+        from octasplat.engine.blocks.scene_so_far import scene_so_far
+
+        if (found := scene_so_far(path)) is not None:
+            return Scene(found)
+    return read_scene(path, progress)
 
 
 def serve_scene(scene: Scene, path: Path | None, *, port: int, background: str) -> Viewer:

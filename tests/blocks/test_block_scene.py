@@ -118,6 +118,7 @@ def test_blocks_that_fit_together_are_finished_together(scene: Path, two_blocks:
     assert np.abs(finished.shading["exposure.offsets"] - coarse.shading["exposure.offsets"]).max() > 1e-4
 
 
+@pytest.mark.exhaustive
 def test_merged_scene_numbers_one_core_after_the_other(scene: Path, polished_blocks: Path) -> None:
     """Each block's kept Gaussians are those in its box, in its order; only those near the cut move on."""
     run = polished_blocks

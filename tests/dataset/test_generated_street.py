@@ -11,9 +11,10 @@ import pytest
 
 from octasplat.engine.core.errors import ConfigError, DatasetError
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
-from octasplat.engine.dataset.synthetic.street import FACADE_Y, HALF_LENGTH, HOUSES, build_street
+from octasplat.engine.dataset.synthetic.street import FACADE_Y, LOT, build_street, half_length
 
 VIEWS = 32
+HOUSES = 8
 STREET = SyntheticDatasetConfig(
     views=VIEWS, width_px=96, height_px=72, samples_per_side=1, points=600, scene="street"
 )
@@ -33,6 +34,7 @@ def read_depth(street: Path, name: str) -> np.ndarray:
     return depth
 
 
+@pytest.mark.exhaustive
 def test_tracks_reproject_and_lie_on_what_is_seen(street: Path) -> None:
     model = pycolmap.Reconstruction(str(street / "sparse" / "0"))
     assert (model.num_reg_images(), model.num_points3D()) == (VIEWS, 600)
@@ -51,31 +53,34 @@ def test_tracks_reproject_and_lie_on_what_is_seen(street: Path) -> None:
     assert np.median(offsets) < 0.03  # the ground is seen at a flat angle
 
 
+@pytest.mark.exhaustive
 def test_every_house_is_photographed_from_several_places(street: Path) -> None:
     model = pycolmap.Reconstruction(str(street / "sparse" / "0"))
     centres = np.array([image.projection_center() for image in model.images.values()])
     assert np.ptp(centres[:, 0]) > 80 and (np.abs(centres[:, 1]) < 3).all() and (centres[:, 2] > 1.4).all()
-    lot = 2 * HALF_LENGTH / HOUSES
+    end = half_length(HOUSES)
     seen: dict[tuple[int, bool], set[int]] = {}
     for point in model.points3D.values():
         x, y, _ = point.xyz
-        if abs(x) < HALF_LENGTH and abs(y) > FACADE_Y - 0.1:
-            place = (int((x + HALF_LENGTH) / lot), bool(y > 0))
+        if abs(x) < end and abs(y) > FACADE_Y - 0.1:
+            place = (int((x + end) / LOT), bool(y > 0))
             seen.setdefault(place, set()).update(element.image_id for element in point.track.elements)
     assert len(seen) == 2 * HOUSES
     assert min(map(len, seen.values())) >= 2
 
 
-def test_houses_do_not_overlap_and_stand_on_the_ground() -> None:
-    houses = [thing for thing in build_street().objects if thing.name.startswith("house")]
+@pytest.mark.parametrize("count", [2, HOUSES])
+def test_houses_do_not_overlap_and_stand_on_the_ground(count: int) -> None:
+    houses = [thing for thing in build_street(count).objects if thing.name.startswith("house")]
     boxes = np.array([[thing.mesh.vertices.min(axis=0), thing.mesh.vertices.max(axis=0)] for thing in houses])
-    assert len(houses) == 2 * HOUSES
+    assert len(houses) == 2 * count
     np.testing.assert_allclose(boxes[:, 0, 2], 0, atol=1e-6)
     for k, (low, high) in enumerate(boxes):
         others = np.delete(boxes, k, axis=0)
         assert not ((others[:, 0, :2] < high[:2]) & (others[:, 1, :2] > low[:2])).all(axis=1).any()
 
 
+@pytest.mark.exhaustive
 def test_names_sort_in_the_order_of_the_views(tmp_path: Path) -> None:
     config = SyntheticDatasetConfig(
         views=1001, width_px=8, height_px=8, samples_per_side=1, points=5, scene="street"

@@ -137,6 +137,17 @@ def test_quota_command_shows_and_sets_limits(conninfo: str, monkeypatch: pytest.
     assert run(quota_command, ["me", "--jobs", "many"]).exit_code == 2
 
 
+@pytest.mark.parametrize(
+    "limit", [("--jobs", "3G"), ("--datasets", "3G"), ("--bytes", "10000000T"), ("--jobs", "²")]
+)
+def test_quota_command_refuses_limits_that_no_table_holds(
+    conninfo: str, monkeypatch: pytest.MonkeyPatch, limit: tuple[str, str]
+) -> None:
+    monkeypatch.setenv("DATABASE_URL", conninfo)
+    done = CliRunner().invoke(quota_command, ["me", *limit])
+    assert done.exit_code == 2 and limit[1] in done.output
+
+
 async def test_connection_pool_is_large_enough(conninfo: str) -> None:
     async with open_pool(conninfo, max_size=2) as pool, pool.connection() as connection:
         await check_bytes(connection, "me", Quota(max_bytes=0))

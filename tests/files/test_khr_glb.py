@@ -9,10 +9,18 @@ import pytest
 
 from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.core.errors import SceneFileError
-from octasplat.engine.files import ExportOptions, export_scene, importer_for, read_mesh, read_scene
+from octasplat.engine.files import (
+    ExportOptions,
+    export_scene,
+    glb_container,
+    importer_for,
+    read_mesh,
+    read_scene,
+)
 from octasplat.engine.gaussians.frames import rotation_matrices
-from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 from octasplat.engine.gaussians.octagon import octagon_corners_world, octagon_radii
+from octasplat.engine.gaussians.rows import row_arrays
 from octasplat.engine.gaussians.spherical_harmonics import sh_basis
 
 Make = Callable[..., FlatGaussians]
@@ -48,6 +56,37 @@ def attribute(document: dict[str, Any], binary: bytes, name: str) -> np.ndarray:
     values = np.frombuffer(raw, kind).reshape(-1, width)
     assert len(values) == accessor["count"]
     return values
+
+
+def test_scene_beyond_the_limit_of_a_file_is_split_in_its_order(
+    make_scene: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = make_scene(5000)
+    (whole,) = export_scene(scene, tmp_path / "whole.splats.glb")
+    limit = int(0.45 * whole.stat().st_size)
+    monkeypatch.setattr(glb_container, "MAX_BYTES", limit)
+    written = export_scene(scene, tmp_path / "a.splats.glb")
+    assert [path.name for path in written] == [
+        "a.splats.glb",
+        "a.splats.part2.glb",
+        "a.splats.part3.glb",
+    ]
+    assert all(path.stat().st_size <= limit for path in written)
+    extras = [parts(path)[0]["asset"]["extras"]["octasplat_part"] for path in written]
+    assert extras == [[1, 3], [2, 3], [3, 3]] and "extras" not in parts(whole)[0]["asset"]
+    together = concatenate([read_scene(path)[0] for path in written])
+    expected = read_scene(whole)[0]
+    for name, array in row_arrays(expected).items():
+        np.testing.assert_array_equal(row_arrays(together)[name], array)
+
+
+def test_attributes_of_other_lengths_are_refused(make_scene: Make, tmp_path: Path) -> None:
+    export_scene(make_scene(30), tmp_path / "a.splats.glb")
+    document, binary = parts(tmp_path / "a.splats.glb")
+    document["accessors"][3]["count"] = 20
+    join(tmp_path / "b.glb", document, binary)
+    with pytest.raises(SceneFileError, match="differ in length"):
+        read_scene(tmp_path / "b.glb")
 
 
 def test_attributes_are_those_of_the_specification(make_scene: Make, tmp_path: Path) -> None:

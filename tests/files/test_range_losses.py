@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.files import dropped_on_export, export_scene, read_scene
+from octasplat.engine.files import dropped_on_export, export_scene, read_scene, spz
 from octasplat.engine.gaussians.model import FlatGaussians
 
 Make = Callable[..., FlatGaussians]
@@ -50,6 +50,16 @@ def test_spz_tells_sizes_that_it_clips_and_the_scale_that_fits(
     back = read_scene(tmp_path / "a.spz")[0].log_scales
     # A byte holds ln of a size in steps of 1/16; the two axes may change places.
     np.testing.assert_allclose(np.sort(back, axis=1), np.sort(scaled.log_scales, axis=1), atol=0.04)
+
+
+def test_spz_tells_more_gaussians_than_its_own_reader_takes(
+    make_gaussians: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = with_sizes(make_gaussians(300), 0.01, 1.0)
+    monkeypatch.setattr(spz, "MAX_READ", 300)
+    assert losses(scene, "a.spz") == ""
+    monkeypatch.setattr(spz, "MAX_READ", 299)
+    assert "takes no SPZ of more than 299 Gaussians; this one has 300" in losses(scene, "a.spz")
 
 
 def test_spz_tells_sizes_that_no_scale_makes_fit(make_gaussians: Make) -> None:

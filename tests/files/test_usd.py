@@ -6,6 +6,7 @@ import pytest
 
 from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.files import export_scene
+from octasplat.engine.files import usd as usd_format
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.spherical_harmonics import sh_basis
 
@@ -54,6 +55,16 @@ def test_usd_surflets_equal_gaussians(make_scene: Make, tmp_path: Path, name: st
     )
     low, high = values("extent")
     assert (low < values("positions").min(axis=0)).all() and (high > values("positions").max(axis=0)).all()
+
+
+def test_package_beyond_what_usd_reads_is_refused(
+    make_scene: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(usd_format, "MAX_BYTES", 1000)
+    with pytest.raises(SceneFileError, match=r"50 Gaussians need .* bytes, and a USDZ .* at most 1,000"):
+        export_scene(make_scene(50), tmp_path / "a.usdz")
+    assert list(tmp_path.iterdir()) == []
+    export_scene(make_scene(50), tmp_path / "a.usdc")
 
 
 @pytest.mark.parametrize("name", ["a.usdc", "a.usdz"])

@@ -78,6 +78,10 @@ STRUCTURES: dict[str, tuple[Callable[[], bytes], str]] = {
     "zip64 without lengths": (
         lambda: build_zip(replace(good(), central={"size": 2**32 - 1})), "archive-damaged",
     ),
+    "zip64 start beyond what a file can have": (
+        lambda: build_zip(replace(good(), central={"start": 2**32 - 1}, central_extra=field_zip64(2**63))),
+        "archive-mismatch",
+    ),
     "zip64 length that lies": (
         lambda: build_zip(replace(good(), central={"size": 2**32 - 1}, central_extra=field_zip64(2**50))),
         "archive-mismatch",

@@ -70,6 +70,7 @@ def centres(model: Path) -> np.ndarray:
     return np.array([image.projection_center() for image in images])
 
 
+@pytest.mark.exhaustive
 def test_lens_check_flags_shifted_principal_points_only(moved: Path, still: Path) -> None:
     for root, expected in ((moved, True), (still, False)):
         scene = load_dataset_model(root)

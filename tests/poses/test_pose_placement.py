@@ -94,5 +94,6 @@ def test_placing_keeps_consistent_pose(given: Pose, partners: int, count: int) -
     assert estimate_pose(matches, given, PIXEL, seed=0) is None
 
 
+@pytest.mark.exhaustive
 def test_placing_inconsistent_matches_keep_pose() -> None:
     assert estimate_pose(matched(TRUE, ring(12), 40, wrong=1.0), WRONG, PIXEL, seed=0) is None

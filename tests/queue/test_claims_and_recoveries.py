@@ -160,7 +160,10 @@ async def test_recovery_is_bounded_in_time(conninfo: str, monkeypatch: pytest.Mo
     assert limits == [ROW_SECONDS]
 
 
-async def test_recovery_names_the_lost_worker(conninfo: str, caplog: pytest.LogCaptureFixture) -> None:
+async def test_recovery_names_the_lost_worker_in_the_log_alone(
+    conninfo: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It has the name of its host, which the owner of the job is not told."""
     caplog.set_level(logging.WARNING, "octasplat.workers.queue.recovery")
     async with open_pool(conninfo, max_size=4) as pool:
         attempt = await claimed(pool)
@@ -170,7 +173,7 @@ async def test_recovery_names_the_lost_worker(conninfo: str, caplog: pytest.LogC
         assert await recover_stalled_jobs(pool, SLIPS, 5, StalledAttempts(0.0)) == 1
         job = await fetched(pool, attempt.job.id)
         assert job.error is not None and job.error["type"] == "worker_lost" and job.error["rescues"] == 3
-        assert job.error["message"].startswith("The worker w was not heard of for 5 s: ")
+        assert job.error["message"].startswith("Its worker was not heard of for 5 s: ")
         assert [record.message for record in caplog.records] == [f"worker w was lost with job {job.id}"]
 
 

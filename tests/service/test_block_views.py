@@ -1,6 +1,6 @@
 """A job in blocks over HTTP: its blocks in its own view, and no trace of them elsewhere."""
 
-from collections.abc import Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from typing import Any
 
 import httpx
@@ -8,6 +8,7 @@ import pytest
 
 from octasplat.engine.core import versions
 from octasplat.service.state import Service
+from octasplat.workers.queue.attempts import Attempt
 from octasplat.workers.queue.block_jobs import NewBlock
 from octasplat.workers.queue.storage_leases import storage_lease
 from tests.support.service_harness import ConnectService, claim_job, committed_dataset, new_job, store_content
@@ -17,11 +18,12 @@ async def job_in_blocks(
     http: httpx.AsyncClient,
     service: Service,
     places: Mapping[str, tuple[float, float]] | None = None,
+    before_blocks: Callable[[Attempt], Awaitable[None]] | None = None,
     **body: Any,
 ) -> dict[str, Any]:
     """A job that waits for two blocks of 20 and 10 iterations, after 5 and with 5 more to come.
 
-    With ``places`` there is a map of them.
+    With ``places`` there is a map of them. ``before_blocks`` is called with the attempt that plans them.
     """
     job = await new_job(http, service, **body)
     digest = store_content(service, b"plan")
@@ -34,6 +36,8 @@ async def job_in_blocks(
         for number, length in ((1, 20), (2, 10))
     ]
     attempt = await claim_job(service, job)
+    if before_blocks is not None:
+        await before_blocks(attempt)
     async with storage_lease(service.pool, service.storage) as lease:
         if places is not None:
             row = {"sha256": store_content(service, b"map"), "step": 5, "view": None}

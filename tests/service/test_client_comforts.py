@@ -4,6 +4,7 @@ import hashlib
 import io
 import json
 import logging
+import uuid
 import zipfile
 from typing import Any
 
@@ -14,6 +15,7 @@ from octasplat.service.app import create_app
 from octasplat.service.request_id import RequestIdFilter
 from octasplat.service.state import Service
 from octasplat.service.zip_stream import ZipEntry, stream_zip
+from octasplat.workers.db.live_scenes import LiveScene, put_live_scene
 from octasplat.workers.db.quotas import Quota, set_quota
 from octasplat.workers.queue.job_results import ResultFile
 from tests.support.service_harness import (
@@ -171,6 +173,23 @@ async def test_lists_are_compressed_and_stored_content_is_not(connect_service: C
             )
             assert answer.content == content and "Content-Encoding" not in answer.headers
             assert int(answer.headers["Content-Length"]) == len(content)
+
+
+async def test_reports_and_states_of_trainings_are_sent_as_they_are_stored(
+    connect_service: ConnectService,
+) -> None:
+    async with connect_service() as (http, service):
+        job = await new_job(http, service)
+        attempt = await claim_job(service, job)
+        page = b"<p>A report.</p>" * 200
+        sha256 = store_content(service, page)
+        await attempt.succeed([ResultFile("report.html", sha256, len(page), "text/html")])
+        async with service.pool.connection() as connection:
+            await put_live_scene(connection, LiveScene(uuid.UUID(job["id"]), sha256, sha256, 1, 1))
+        for address in (f"/v1/jobs/{job['id']}/live-scene", f"/jobs/{job['id']}/report"):
+            answer = await http.get(address, headers={"Accept-Encoding": "gzip"})
+            assert answer.content == page and "Content-Encoding" not in answer.headers, address
+            assert int(answer.headers["Content-Length"]) == len(page)
 
 
 def test_messages_to_webhooks_are_described() -> None:

@@ -68,6 +68,7 @@ async def test_scene_is_fetched_from_an_address(connect_service: ConnectService,
             (f"{elsewhere}/cut.zip", "import", "broke off"),
             (f"{elsewhere}/to=https://10.0.0.1/x.zip", "import-address", "reachable from everywhere"),
             (f"{elsewhere}/to=file:///etc/passwd", "import-address", "cannot be read"),
+            (f"{elsewhere}/to=https://[/x.zip", "import", "cannot be reached"),
             ("http://127.0.0.1:1/x.zip", "import", "cannot be reached"),
         ):
             address, task = await fetch(url=url)

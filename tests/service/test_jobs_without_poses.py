@@ -49,6 +49,7 @@ def machine(short_root: Path) -> Iterator[Machine]:
     machine.stop()
 
 
+@pytest.mark.exhaustive
 def test_reconstruct_folder_without_poses_succeeds(
     machine: Machine, octasplat: Octasplat, tmp_path: Path
 ) -> None:

@@ -16,7 +16,7 @@ def write_neighbours(folder: Path, count: int) -> dict[str, Float64[np.ndarray, 
     """Take the first ``count`` of 40 photographs, which is enough for COLMAP; returns where from, by name."""
     config = SyntheticDatasetConfig(views=40, width_px=480, height_px=360, samples_per_side=1)
     camera = synthetic_camera(config)
-    photographer = PhotographRenderer(cached_lit_scene(config.scene), camera, config)
+    photographer = PhotographRenderer(cached_lit_scene(config.scene, config.houses), camera, config)
     folder.mkdir(parents=True)
     taken = synthetic_views(config)[:count]
     for view in taken:

@@ -67,6 +67,7 @@ def scene_and_cameras(root: Path, **size: int) -> tuple[DatasetModel, tuple[Pinh
     return scene, photograph_cameras(scene, np.arange(len(scene.views)), 800)
 
 
+@pytest.mark.exhaustive
 def test_true_depth_gives_the_true_surface(tmp_path):
     scene, cameras = scene_and_cameras(
         tmp_path / "scene", views=30, width_px=240, height_px=180, samples_per_side=1, points=100

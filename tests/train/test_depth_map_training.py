@@ -122,6 +122,7 @@ def test_maps_make_the_geometry_right(plain_scene: Path, measured_scene: Path, t
     assert errors[1] < 0.03
 
 
+@pytest.mark.exhaustive
 def test_known_geometry_makes_the_geometry_right(
     plain_scene: Path, measured_scene: Path, tmp_path: Path
 ) -> None:
@@ -158,6 +159,7 @@ def test_few_maps_and_no_sparse_points_begin_a_training(measured_scene: Path, tm
     assert 50 < lifted < swept - 200 and swept <= 400
 
 
+@pytest.mark.exhaustive
 def test_stopped_training_with_maps_goes_on_to_the_same_bytes(measured_scene: Path, tmp_path: Path) -> None:
     whole = reconstruct(measured_scene, tmp_path / "whole", make_config(), threads=1)
     stop = [False]

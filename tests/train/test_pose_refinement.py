@@ -191,6 +191,7 @@ def test_pose_refinement_removes_global_motion() -> None:
     assert (left[world.train_indices[0]] == 0).all() and (left[world.test_indices] == 0).all()
 
 
+@pytest.mark.exhaustive
 def test_stopped_and_on_other_threads_the_same_bits_come_out(tmp_path: Path) -> None:
     whole, _ = train(tmp_path / "whole", refine_poses=True, iterations=80)
     asked = 0

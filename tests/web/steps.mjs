@@ -162,6 +162,40 @@ const steps = {
         return found;
     },
 
+    /** Each folder or file is sent and its job queued; of the first one `cut` parts arrive before the page is left. */
+    async sent() {
+        const found = { puts: [], jobs: [] };
+        const send = async (chosen, cut = Infinity) => {
+            const page = await open(), puts = [];
+            let arrived = 0, begun = 0;
+            page.on("requestfinished", async (request) => { if (request.method() === "PUT" && (await request.response())?.ok()) arrived += 1; });
+            await page.route("**/v1/datasets/**", (route) => {
+                const request = route.request();
+                if (request.method() !== "PUT") return route.continue();
+                if (begun++ >= cut) return route.abort("connectionfailed");
+                puts.push(decodeURIComponent(new URL(request.url()).pathname.split("/").slice(4).join("/")).replace(/[0-9a-f-]{36}/, "ID"));
+                return route.continue();
+            });
+            await page.goto(`${job.url}/new`);
+            await page.setInputFiles(chosen.endsWith(".zip") ? "#pick-files" : "#pick-folder", chosen);
+            await page.waitForFunction(() => document.getElementById("chosen-text").textContent);
+            await page.click("#start");
+            if (cut < Infinity) {
+                await page.waitForFunction(() => /connection is lost/.test(document.getElementById("going-text").textContent));
+                while (arrived < cut) await page.waitForTimeout(50);
+                await shot(page, "large_interrupted");
+            } else {
+                await page.waitForURL("**/jobs/*-*");
+                found.jobs.push(page.url().split("/").pop());
+            }
+            await page.context().close();
+            found.puts.push(puts.sort());
+        };
+        await send(job.chosen[0], job.cut);
+        for (const chosen of job.chosen) await send(chosen);
+        return found;
+    },
+
     /** A job that waits, runs and ends while its page and the list are open; nothing is reloaded by hand. */
     async watch() {
         const page = await open(), list = await open();
@@ -761,6 +795,36 @@ const steps = {
         await page.waitForSelector("#status[data-state=canceled]");
         found.polled = true;
         return found;
+    },
+
+    /** Notes in a 3D view, some of which were written after the page was loaded. */
+    async notes() {
+        const page = await open();
+        await page.goto(`${job.url}/jobs/${job.job}`);
+        await page.waitForSelector("#viewer .view-notes li");
+        await page.evaluate(({ address, notes }) => fetch(address, { method: "PATCH", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ view_notes: notes }) }), { address: `/v1/jobs/${job.job}`, notes: job.notes });
+        await page.click("#viewer .view-notes li:first-child [aria-label^=Remove]");
+        await page.waitForFunction((text) => !document.querySelector("#viewer .view-notes").textContent.includes(text), job.notes[0].text);
+        return { shown: await page.locator("#viewer .view-notes li button:first-child").allTextContents() };
+    },
+
+    /** The log of a job, one request of which the service could not answer. */
+    async log() {
+        const page = await open();
+        const asked = [];
+        await page.route("**/logs?*", (route) => {
+            asked.push(new URL(route.request().url()).searchParams.get("after"));
+            if (asked.length > 1) return route.continue();
+            return route.fulfill({ status: 503, contentType: "application/problem+json", body: '{"title": "busy"}' });
+        });
+        await page.goto(`${job.url}/jobs/${job.job}`);
+        if (!await page.evaluate(() => document.getElementById("log-fold").open)) await page.click("#log-fold summary");
+        await page.waitForFunction(() => document.getElementById("log").textContent.includes("a line"), undefined, { timeout: 30000 });
+        // Folded and opened again, it goes on where it was.
+        await page.click("#log-fold summary");
+        await page.click("#log-fold summary");
+        await page.waitForTimeout(3000);
+        return { asked, lines: await page.evaluate(() => document.getElementById("log").textContent.split("a line").length - 1) };
     },
 };
 

@@ -224,6 +224,22 @@ async def test_queue_is_paused_and_worker_drained_on_the_page(
         assert gone.status_code == 404
 
 
+async def test_worker_whose_name_holds_a_slash_is_drained(
+    connect_service: ConnectService, database: str
+) -> None:
+    async with connect_service() as (http, _):
+        async with open_pool(database, max_size=1, wait_seconds=10) as pool, pool.connection() as connection:
+            await record_worker_heartbeat(
+                connection, uuid.uuid4(), name="rack/box", queues=["night"], slots=2, facts={}
+            )
+        action = re.search(r'action="(/admin/workers/rack[^"]*)"', (await http.get("/admin")).text)
+        assert action is not None
+        done = await http.post(action[1], follow_redirects=False)
+        assert (done.status_code, done.headers["location"]) == (303, "/admin")
+        drained = await http.patch("/v1/workers/rack%2Fbox", json={"drained": False})
+        assert drained.status_code == 200 and drained.json()["name"] == "rack/box"
+
+
 async def test_form_of_a_new_job_has_the_settings_of_another(
     connect_service: ConnectService, database: str
 ) -> None:

@@ -39,7 +39,7 @@ def rows(bench: WorkerHarness, table: str) -> int:
     return int(found[0])
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.exhaustive), 2])
 def test_blocks_are_trained_by_all_workers_and_one_job_is_seen(bench: WorkerHarness, workers: int) -> None:
     for number in range(workers):
         bench.worker(name=f"w{number}", **KINDS)
@@ -151,6 +151,7 @@ def test_cancelled_whole_without_workers_ends_at_once(bench: WorkerHarness) -> N
     assert set(states(bench, root)) == {"canceled"} and rows(bench, "procrastinate_jobs") == 0
 
 
+@pytest.mark.exhaustive
 def test_retry_from_the_start_plans_anew(bench: WorkerHarness) -> None:
     bench.worker(**KINDS)
     root = submit(bench, refuse=2)

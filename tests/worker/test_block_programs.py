@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from octasplat.engine.blocks.scene_plan import load_plan
 from octasplat.engine.core.events import CheckpointWritten, Event
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
 from octasplat.engine.pipeline import BlockRequest, reconstruct
@@ -110,7 +111,10 @@ def test_programs_hand_over_what_makes_the_bytes_of_one_process(scene: Path, tmp
     coarse = load_best(first.folder / "run" / "blocks" / "coarse").gaussians
     assert [event.step for event in shown_scenes] == [0, 15] and shown_scenes[1].gaussians == len(coarse)
     live = read_gaussian_ply(first.folder / "run" / shown_scenes[1].path)[0]
-    assert np.array_equal(live.means_world, coarse.means_world)
+    cores = [block.core for block in load_plan(first.folder / "run" / "blocks").blocks]
+    places = [coarse.means_world[core.contains(coarse.means_world)] for core in cores]
+    assert shown_scenes[1].block_gaussians == tuple(map(len, places))
+    assert min(map(len, places)) > 0 and np.array_equal(live.means_world, np.concatenate(places))
     cameras = json.loads((first.folder / "run" / shown_scenes[1].views).read_text())["views"]
     assert [camera["held_out"] for camera in cameras] == [view % 4 == 0 for view in range(16)]
     checkpoint = first.store_checkpoint("train", 15)
@@ -138,6 +142,12 @@ def test_programs_hand_over_what_makes_the_bytes_of_one_process(scene: Path, tmp
         assert views_there(photographs, "masks") == {view for view in shown[number] if view % 2}
         events, _ = run_task(train_block, block, given, photographs)
         assert 25 in [event.iteration for event in events if isinstance(event, CheckpointWritten)]
+        (shown_block,) = [event for event in events if isinstance(event, LiveSceneWritten)]
+        learnt = load_best(block.folder / "run" / "blocks" / f"block_{number:03d}").gaussians
+        in_core = cores[number - 1].contains(learnt.means_world)
+        live = read_gaussian_ply(block.folder / "run" / shown_block.path)[0]
+        assert shown_block.step == 30 and shown_block.gaussians == in_core.sum() < len(learnt)
+        assert np.array_equal(live.means_world, learnt.means_world[in_core])
         own = block.store_checkpoint("train", 30)
         assert own is not None
         folder = f"run/blocks/block_{number:03d}"

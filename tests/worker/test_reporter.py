@@ -2,12 +2,14 @@
 
 import asyncio
 import contextlib
+import uuid
 from collections.abc import AsyncIterator
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from octasplat.workers.db.live_scenes import LiveScene
 from octasplat.workers.storage.errors import StorageError
 from octasplat.workers.worker import reporter
 from octasplat.workers.worker.reporter import Reporter
@@ -135,3 +137,35 @@ async def test_reporter_says_which_file_was_not_stored(monkeypatch: pytest.Monke
         for what, name in (("preview", "preview.jpg"), ("live scene", "l.ply"))
     ]
     assert workspace.checkpoints == 1
+
+
+async def test_reporter_records_how_many_gaussians_are_of_each_block(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Recorder(SlowJournal):
+        pool = None
+        job = SimpleNamespace(id=uuid.uuid4())
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.scenes: list[LiveScene] = []
+
+        async def record_live_scene(self, scene: LiveScene, _lease: None) -> None:
+            self.scenes.append(scene)
+
+    @contextlib.asynccontextmanager
+    async def no_lease(*_: object) -> AsyncIterator[None]:
+        yield None
+
+    monkeypatch.setattr(reporter, "storage_lease", no_lease)
+    journal = Recorder()
+    workspace = SimpleNamespace(storage=None, store_file=lambda name: name)
+    child = Reporter(journal, workspace)  # type: ignore[arg-type]
+    said: list[Any] = [[3, 0, 2], (), [3, 1], [6, -1], ["x"], 5, [2.0, 3.0]]
+    for counts in said:
+        live = {"path": "l.ply", "views": "v", "step": 7, "gaussians": 5, "block_gaussians": counts}
+        child.on_event({"kind": "live_scene_written", **live})
+        while child._live_scene is not None or not journal.scenes:
+            await asyncio.sleep(0.01)
+        await asyncio.sleep(0.02)
+    await child.finish()
+    assert [scene.block_gaussians for scene in journal.scenes] == [[3, 0, 2], *[None] * 5, [2, 3]]
+    assert {(scene.step, scene.gaussians) for scene in journal.scenes} == {(7, 5)}

@@ -113,6 +113,7 @@ def test_training_begins_with_what_another_job_has_made(
     assert str(shared_bench.folder) not in texts(shared_bench, job)
 
 
+@pytest.mark.exhaustive
 def test_stopped_training_is_gone_on_with_to_the_same_bytes_after_a_kill(
     shared_bench: WorkerHarness, scene: Path, dataset: uuid.UUID, stopped: uuid.UUID, tmp_path: Path
 ) -> None:

@@ -217,6 +217,7 @@ def service(
             bench.close()
 
 
+@pytest.mark.exhaustive
 def test_front_end_is_upgraded_before_workers(service: Service) -> None:
     """Jobs are under way at both changes, and those of the new front end are run by the old worker."""
     bench = service.bench

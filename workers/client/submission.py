@@ -301,7 +301,10 @@ def _id_with_notes(dataset: dict[str, Any], on_event: EventListener) -> str:
 
 
 def _parse_id(text: str) -> str | None:
+    """Return the id of a dataset that a text is; None where it is none, or the name of a folder."""
     try:
-        return str(uuid.UUID(text))
+        dataset_id = str(uuid.UUID(text))
     except ValueError:
         return None
+    # Without its dashes an id may be the name of a folder as well, as a digest is.
+    return None if text.lower() != dataset_id and Path(text).exists() else dataset_id

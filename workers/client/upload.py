@@ -140,11 +140,11 @@ def upload_scene(
     """
     is_archive = scene.is_file()
     if is_archive:
-        files = [LocalFile(scene.name, scene, scene.stat().st_size)]
+        files = [LocalFile(_replace_non_utf8(scene.name), scene, scene.stat().st_size)]
         _preview_archive(api, scene, on_warning)
     else:
         files = list_scene_files(api, scene, on_warning)
-    dataset = _find_or_create_dataset(api, name or scene.resolve().stem, files)
+    dataset = _find_or_create_dataset(api, name or _replace_non_utf8(scene.resolve().stem), files)
     if is_archive and dataset["state"] == "open":
         _send_archive(api, dataset["id"], files[0], progress)
     else:
@@ -190,7 +190,7 @@ def _find_or_create_dataset(
         # In the place of the contents, which would all have to be read first.
         facts = file.path.stat()
         digest.update(f"{file.name}\0{facts.st_size}\0{facts.st_mtime_ns}\0{facts.st_ino}\n".encode())
-    body = {"name": name, "holds": holds} if holds == "files" else {"name": name}
+    body = {"name": name[:200]} | ({"holds": holds} if holds == "files" else {})
     return create_dataset_once(api, body, f"scene-{digest.hexdigest()}")
 
 

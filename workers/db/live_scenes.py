@@ -1,7 +1,13 @@
-"""Live scenes: the newest state of a training, decimated, with its cameras."""
+"""Live scenes: the newest state of a training, decimated, with its cameras.
+
+The file of a job in blocks has the Gaussians of one block after those of the other. A block that is trained
+has a row of its own job, and its file is shown in their place: nobody writes what two blocks share, so that
+blocks may end at once, on any workers.
+"""
 
 import uuid
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from octasplat.workers.db.connections import Connection, fetch_one
 
@@ -16,6 +22,7 @@ class LiveScene:
         views_sha256: of the JSON file of the cameras.
         step: iterations that are done; 0 for the sparse points before the training.
         gaussians: number of Gaussians in the file.
+        block_gaussians: of each block, one after the other, in the file of a scene in blocks; else None.
     """
 
     job_id: uuid.UUID
@@ -23,23 +30,89 @@ class LiveScene:
     views_sha256: str
     step: int
     gaussians: int
+    block_gaussians: list[int] | None = None
 
 
-async def get_live_scene(connection: Connection, job_id: uuid.UUID) -> LiveScene | None:
-    """Return the live scene of a job; None if it has none."""
-    return await fetch_one(connection, LiveScene, "SELECT {} FROM live_scenes WHERE job_id = %s", [job_id])
+@dataclass(frozen=True)
+class LiveBlock:
+    """What a trained block shows in the place of its part of the scene.
+
+    Attributes:
+        sha256: of its PLY file.
+        gaussians: number of Gaussians in the file.
+        iterations: of its training.
+    """
+
+    sha256: str
+    gaussians: int
+    iterations: int
+
+
+@dataclass(frozen=True)
+class ShownScene:
+    """What is shown of a training.
+
+    Attributes:
+        scene: the newest state.
+        blocks: those that are trained, by number.
+    """
+
+    scene: LiveScene
+    blocks: Mapping[int, LiveBlock] = field(default_factory=dict)
+
+    @property
+    def step(self) -> int:
+        """Return the iterations that are done of what is shown."""
+        return self.scene.step + sum(block.iterations for block in self.blocks.values())
+
+    @property
+    def gaussians(self) -> int:
+        """Return the number of Gaussians that are shown."""
+        counts = self.scene.block_gaussians or []
+        more = sum(block.gaussians - counts[number - 1] for number, block in self.blocks.items())
+        return self.scene.gaussians + more
+
+
+async def get_shown_scene(connection: Connection, job_id: uuid.UUID) -> ShownScene | None:
+    """Return what is shown of a job's training; None if there is nothing."""
+    query = "SELECT {} FROM live_scenes WHERE job_id = %s"
+    scene = await fetch_one(connection, LiveScene, query, [job_id])
+    if scene is None:
+        return None
+    counts = scene.block_gaussians
+    # Not so where a worker of the former version has written another file since.
+    if not counts or sum(counts) != scene.gaussians:
+        return ShownScene(scene)
+    cursor = await connection.execute(
+        """
+        SELECT (jobs.options->>'number')::int AS number, sha256, gaussians,
+            coalesce((jobs.options->>'iterations')::int, 0) AS iterations
+        FROM live_scenes JOIN jobs ON jobs.id = live_scenes.job_id
+        WHERE jobs.root_id = %s AND jobs.state = 'succeeded' ORDER BY number
+        """,
+        [job_id],
+    )
+    found = {row.pop("number"): LiveBlock(**row) for row in await cursor.fetchall()}
+    return ShownScene(scene, {number: block for number, block in found.items() if 0 < number <= len(counts)})
 
 
 async def put_live_scene(connection: Connection, scene: LiveScene) -> None:
     """Replace the live scene of a job."""
     await connection.execute(
         """
-        INSERT INTO live_scenes (job_id, sha256, views_sha256, step, gaussians)
-        VALUES (%s, %s, %s, %s, %s)
+        INSERT INTO live_scenes (job_id, sha256, views_sha256, step, gaussians, block_gaussians)
+        VALUES (%s, %s, %s, %s, %s, %s)
         ON CONFLICT (job_id) DO UPDATE SET sha256 = excluded.sha256, views_sha256 = excluded.views_sha256,
-            step = excluded.step, gaussians = excluded.gaussians
+            step = excluded.step, gaussians = excluded.gaussians, block_gaussians = excluded.block_gaussians
         """,
-        [scene.job_id, scene.sha256, scene.views_sha256, scene.step, scene.gaussians],
+        [
+            scene.job_id,
+            scene.sha256,
+            scene.views_sha256,
+            scene.step,
+            scene.gaussians,
+            scene.block_gaussians,
+        ],
     )
 
 

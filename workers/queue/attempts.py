@@ -19,6 +19,7 @@ from octasplat.workers.db.rows import Job
 from octasplat.workers.queue.block_jobs import (
     ROOT,
     NewBlock,
+    add_live_scene_event,
     drop_lost_blocks,
     forget_block_results,
     release_needs,
@@ -145,8 +146,7 @@ class Attempt:
         contents = [scene.sha256, scene.views_sha256]
         async with self._fenced_transaction(lease, contents) as (connection, job):
             await put_live_scene(connection, scene)
-            event_data = {"step": scene.step, "gaussians": scene.gaussians}
-            await add_event(connection, job.id, job.attempt, "live_scene", event_data)
+            await add_live_scene_event(connection, job)
 
     async def record_begun_anew(self, reason: str) -> None:
         """Record why the attempt does not go on from the checkpoint of an earlier one."""

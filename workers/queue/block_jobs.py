@@ -18,6 +18,7 @@ from octasplat.engine.core.errors import CheckpointError
 from octasplat.workers.db.connections import Connection, fetch_all
 from octasplat.workers.db.errors import ConflictError, NotFoundError
 from octasplat.workers.db.events_and_logs import add_event, add_log_lines
+from octasplat.workers.db.live_scenes import get_shown_scene
 from octasplat.workers.db.locks import about_to_lock_jobs
 from octasplat.workers.db.postgres_text import as_json
 from octasplat.workers.db.rows import Job
@@ -129,8 +130,17 @@ async def release_needs(connection: Connection, job_queue: JobQueue | None, chil
         left = await _count_needs(connection, root.id)
         data = {"block": int(child.options["number"]), "left": left}
         await add_event(connection, root.id, root.attempt, "block_finished", data)
+        await add_live_scene_event(connection, root)
         if job_queue is not None and root.state == "running" and not left:
             await _continue_root(connection, job_queue, root)
+
+
+async def add_live_scene_event(connection: Connection, job: Job) -> None:
+    """Tell what is shown of a job's training, if there is anything; the caller holds the job's lock."""
+    shown = await get_shown_scene(connection, job.id)
+    if shown is not None:
+        data = {"step": shown.step, "gaussians": shown.gaussians}
+        await add_event(connection, job.id, job.attempt, "live_scene", data)
 
 
 async def settle_root(connection: Connection, job_queue: JobQueue, root_id: uuid.UUID) -> None:
@@ -254,6 +264,9 @@ async def forget_block_results(connection: Connection, root: Job) -> None:
     """Remove what the blocks of a job have made, which is in its own results now."""
     await connection.execute(
         "DELETE FROM artifacts WHERE job_id IN (SELECT id FROM jobs WHERE root_id = %s)", [root.id]
+    )
+    await connection.execute(
+        "DELETE FROM live_scenes WHERE job_id IN (SELECT id FROM jobs WHERE root_id = %s)", [root.id]
     )
 
 

@@ -27,7 +27,7 @@ async def end_job(connection: Connection, job: Job, state: str, error: Mapping[s
         """,
         [state, as_json_or_null(error), state == "succeeded", job.id],
     )
-    if state == "succeeded":
+    if state == "succeeded" and job.root_id is None:  # a block is shown until the whole job has its results
         await remove_live_scene(connection, job.id)
     data: dict[str, Any] = {"state": state}
     if error is not None:

@@ -36,6 +36,7 @@ _NEWEST_JOBS: LiteralString = (
     + _MATCHING
     + "ORDER BY id DESC LIMIT %(limit)s"
 )
+_OLDEST_JOBS: LiteralString = _NEWEST_JOBS.replace("id < ", "id > ").replace("id DESC", "id")
 # All keys ascend, so that one comparison of rows begins the next page; jobs without a value get 1: last.
 _KEYS: LiteralString = """
     CASE WHEN %(order)s = 'name' THEN
@@ -53,7 +54,7 @@ _ORDERED_JOBS: LiteralString = (
     + _KEYS
     + ") > (SELECT "
     + _KEYS
-    + " FROM jobs WHERE id = %(before)s)) AND "
+    + " FROM jobs WHERE id = %(before)s AND (%(owner)s::text IS NULL OR owner = %(owner)s))) AND "
     + _MATCHING
     + "ORDER BY "
     + _KEYS
@@ -179,14 +180,14 @@ async def list_jobs(
         label: with this label.
         dataset_id: on this dataset.
         text: with this in the label, the kind or the name of the dataset, or at the end of the id.
-        before: that come behind this job.
+        before: that come behind this job; none where it is gone or another's, but by age.
         order: which come first.
         limit: at most so many.
     """
     return await fetch_all(
         connection,
         Job,
-        _NEWEST_JOBS if order == "newest" else _ORDERED_JOBS,
+        {"newest": _NEWEST_JOBS, "oldest": _OLDEST_JOBS}.get(order, _ORDERED_JOBS),
         {
             "text": text,
             "owner": owner,

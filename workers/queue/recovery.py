@@ -90,9 +90,10 @@ async def recover_stalled_jobs(
             lost = stalled.confirm(await cursor.fetchall())
             for job in lost:
                 logger.warning("worker %s was lost with job %s", job.worker, job.id)
+                # The owner reads it; a worker has the name of its host, which is for administrators.
                 message = (
-                    f"The worker {job.worker} was not heard of for {stale_seconds:g} s: it was killed, froze "
-                    "or lost the database."
+                    f"Its worker was not heard of for {stale_seconds:g} s: it was killed, froze or lost the "
+                    "database."
                 )
                 await recover_attempt(connection, job_queue, job, {"type": "worker_lost", "message": message})
         # A transaction each, so that no job is locked while another is waited for.

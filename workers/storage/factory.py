@@ -21,11 +21,10 @@ def open_storage(address: str | Path, *, floor_bytes: int = DEFAULT_FLOOR_BYTES)
         ConfigError: the address cannot be understood or what it needs is not installed.
         StorageUnavailableError: the folder cannot be used.
     """
-    if isinstance(address, Path) or "://" not in address:
-        return LocalStorage(Path(address).absolute(), floor_bytes=floor_bytes)
-    parts = urlsplit(address)
-    if parts.scheme == "file" and parts.netloc in ("", "localhost"):
-        return LocalStorage(Path(parts.path), floor_bytes=floor_bytes)
+    folder = store_folder(address)
+    if folder is not None:
+        return LocalStorage(folder, floor_bytes=floor_bytes)
+    parts = urlsplit(str(address))
     if parts.scheme != "s3" or not parts.netloc or parts.username:
         raise ConfigError(
             f"{parts.scheme}://... is not a store; name a folder or s3://bucket/prefix (no password in it)."
@@ -37,3 +36,11 @@ def open_storage(address: str | Path, *, floor_bytes: int = DEFAULT_FLOOR_BYTES)
     prefix = parts.path.strip("/")
     endpoint = parse_qs(parts.query).get("endpoint_url", [None])[0]
     return S3Storage(parts.netloc, f"{prefix}/" if prefix else "", endpoint_url=endpoint)
+
+
+def store_folder(address: str | Path) -> Path | None:
+    """Return the folder of the store that ``address`` names, absolute; None where it is no folder."""
+    if isinstance(address, Path) or "://" not in address:
+        return Path(address).absolute()
+    parts = urlsplit(address)
+    return Path(parts.path) if parts.scheme == "file" and parts.netloc in ("", "localhost") else None

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -15,7 +15,7 @@ from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset import Dataset, SparsePoints, Viewpoints, load_dataset_model, scene_extent
 from octasplat.engine.dataset.views_file import SplitViewpoints
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
-from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 from octasplat.engine.train.initialization.initial_gaussians import gaussians_from_points
 
 SCENE_FILE, VIEWS_FILE = ".live_scene.ply", ".live_views.json"
@@ -39,6 +39,8 @@ class LiveSceneWritten(Event):
     views: str
     step: int
     gaussians: int
+    block_gaussians: tuple[int, ...] = ()
+    """Of a scene in blocks how many Gaussians of the file are of each, one block after the other."""
 
 
 class LiveSceneWriter:
@@ -70,10 +72,15 @@ class LiveSceneWriter:
             return
         self._write(0, gaussians, found, set(found.held_out or ()))
 
-    def write_state(self, step: int, gaussians: FlatGaussians, views: SplitViewpoints) -> None:
-        """Write a state at once, with the cameras of its run."""
-        held_out = {views.views[index].name for index in views.test_indices}
-        self._write(step, heaviest(gaussians, MAX_GAUSSIANS), views, held_out)
+    def write_blocks(self, step: int, cores: Sequence[FlatGaussians], views: SplitViewpoints) -> None:
+        """Write the state of a scene in blocks at once, the Gaussians of each in its core."""
+        shown = [heaviest(core, block_limit(len(cores))) for core in cores]
+        counts = tuple(len(part) for part in shown)
+        self._write(step, concatenate(shown), views, _held_out(views), counts)
+
+    def write_block(self, step: int, core: FlatGaussians, count: int, views: SplitViewpoints) -> None:
+        """Write what one of ``count`` blocks has learnt, the Gaussians in its core."""
+        self._write(step, heaviest(core, block_limit(count)), views, _held_out(views))
 
     def __call__(self, iteration: int, dataset: Dataset, gaussians: FlatGaussians) -> None:
         """Write the state of the training if that is due."""
@@ -87,13 +94,23 @@ class LiveSceneWriter:
         self._next_at = began + wait
 
     def _write(
-        self, step: int, gaussians: FlatGaussians, views: Viewpoints, held_out: Collection[str]
+        self,
+        step: int,
+        gaussians: FlatGaussians,
+        views: Viewpoints,
+        held_out: Collection[str],
+        block_gaussians: tuple[int, ...] = (),
     ) -> None:
         if len(gaussians) == 0:
             return
         write_gaussian_ply(gaussians, self._run / SCENE_FILE)
         write_json(self._run / VIEWS_FILE, views_content(views, held_out))
-        self._listener(LiveSceneWritten(SCENE_FILE, VIEWS_FILE, step, len(gaussians)))
+        self._listener(LiveSceneWritten(SCENE_FILE, VIEWS_FILE, step, len(gaussians), block_gaussians))
+
+
+def block_limit(count: int) -> int:
+    """Return the most Gaussians that are shown of each of ``count`` blocks."""
+    return max(1, MAX_GAUSSIANS // count)
 
 
 def heaviest(gaussians: FlatGaussians, count: int) -> FlatGaussians:
@@ -135,6 +152,10 @@ def views_content(views: Viewpoints, held_out: Collection[str]) -> dict[str, Any
             for view in views.views
         ],
     }
+
+
+def _held_out(views: SplitViewpoints) -> set[str]:
+    return {views.views[index].name for index in views.test_indices}
 
 
 def _point_gaussians(views: Viewpoints, points: SparsePoints) -> FlatGaussians:

@@ -3,7 +3,7 @@
 import shutil
 
 from octasplat.engine.blocks.block_map import draw_block_map
-from octasplat.engine.blocks.scene_plan import COARSE, ScenePlan, block_name, has_plan
+from octasplat.engine.blocks.scene_plan import COARSE, ScenePlan, block_name, has_plan, load_plan
 from octasplat.engine.core.compiling import report_compilation
 from octasplat.engine.core.errors import CheckpointError, ConfigError, OctasplatError
 from octasplat.engine.core.events import (
@@ -90,6 +90,7 @@ def train_block(task: Task) -> None:
         _run_step(task, options, TrainBlock(options.number))
     for path in block_files(task.run, options.number):
         publish_file(task, path, path.relative_to(task.run).as_posix())
+    _show_block(task, options)
 
 
 def _plan_blocks(
@@ -130,7 +131,25 @@ def _show_coarse_scene(task: Task, options: ReconstructJobConfig, plan: ScenePla
     """Let the coarse scene be the live scene for as long as blocks are trained."""
     coarse = load_best(task.run / BLOCKS / COARSE).gaussians
     views = read_views(task.run / VIEWS).viewpoints(options.max_side)
-    LiveSceneWriter(task.run, task.progress).write_state(plan.coarse_iterations, coarse, views)
+    cores = [coarse.select(block.core.contains(coarse.means_world)) for block in plan.blocks]
+    LiveSceneWriter(task.run, task.progress).write_blocks(plan.coarse_iterations, cores, views)
+
+
+def _show_block(task: Task, options: BlockJobConfig) -> None:
+    """Let what a block has learnt be its live scene, which is shown in the place of the coarse Gaussians.
+
+    Its results are there by now, and count whatever becomes of this.
+    """
+    try:
+        plan = load_plan(task.run / BLOCKS)
+        found = load_best(task.run / BLOCKS / block_name(options.number)).gaussians
+        core = found.select(plan.blocks[options.number - 1].core.contains(found.means_world))
+        views = read_views(task.run / VIEWS).viewpoints(options.max_side)
+        live = LiveSceneWriter(task.run, task.progress)
+        live.write_block(options.iterations, core, len(plan.blocks), views)
+    except (OctasplatError, OSError) as error:
+        message = path_redactor(task).replace_job_paths(str(error))
+        task.progress(Warned(f"What the block has learnt is not shown before the merge: {message}"))
 
 
 def _run_step(

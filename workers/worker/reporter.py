@@ -25,7 +25,13 @@ from octasplat.workers.reporting.events import decode_event, encode_training_pro
 from octasplat.workers.reporting.time_left import TimeLeftEstimator, work_of_stage
 from octasplat.workers.storage.errors import StorageError
 from octasplat.workers.worker.checkpoint import Checkpoint
-from octasplat.workers.worker.task import RUN_FOLDER, BlocksPlanned, read_block_positions, read_planned_blocks
+from octasplat.workers.worker.task import (
+    RUN_FOLDER,
+    BlocksPlanned,
+    read_block_gaussians,
+    read_block_positions,
+    read_planned_blocks,
+)
 from octasplat.workers.worker.workspace import Workspace
 
 logger = logging.getLogger(__name__)
@@ -262,7 +268,12 @@ class Reporter:
                 for name in ("path", "views")
             ]
             scene = LiveScene(
-                self._attempt.job.id, sha256, views_sha256, int(event["step"]), int(event["gaussians"])
+                self._attempt.job.id,
+                sha256,
+                views_sha256,
+                int(event["step"]),
+                int(event["gaussians"]),
+                read_block_gaussians(event),
             )
             await self._attempt.record_live_scene(scene, note)
 

@@ -82,6 +82,16 @@ def read_block_positions(event: Mapping[str, Any]) -> dict[str, tuple[float, flo
     return found if is_plausible else {}
 
 
+def read_block_gaussians(event: Mapping[str, Any]) -> list[int] | None:
+    """Return how many Gaussians of a live scene are of each block; None where a program does not say so."""
+    try:
+        counts = [int(count) for count in event.get("block_gaussians", ())]
+    except (TypeError, ValueError, OverflowError):
+        return None
+    is_plausible = 0 < len(counts) <= MAX_BLOCKS and all(0 <= count < 2**31 for count in counts)
+    return counts if is_plausible and sum(counts) == event.get("gaussians") else None
+
+
 @dataclass(frozen=True)
 class Task:
     """One job, as its program sees it.

@@ -24,7 +24,8 @@ class SyntheticDatasetConfig:
         transparent: Write RGBA photographs (straight alpha) that show the table and its objects only, with
             their coverage of each pixel as alpha. Of the street all but the sky is shown.
         with_masks: Also write the object masks where a reconstruction looks for them: ``masks/``.
-        scene: One of ``SCENES``: a still life on a table, or a street of 112 m for captures of many views.
+        scene: One of ``SCENES``: a still life on a table, or a street for captures of many views.
+        houses: Of the street: houses on each side, each of which takes 14 m of its length.
 
     Raises:
         ConfigError: If a value is out of range.
@@ -40,6 +41,7 @@ class SyntheticDatasetConfig:
     transparent: bool = False
     with_masks: bool = False
     scene: str = "still_life"
+    houses: int = 8
 
     def __post_init__(self) -> None:
         ranges = {
@@ -49,6 +51,7 @@ class SyntheticDatasetConfig:
             "samples_per_side": (1, 16),
             "points": (1, 1_000_000),
             "seed": (0, 2**32 - 1),
+            "houses": (1, 24),
         }
         for name, (low, high) in ranges.items():
             value = getattr(self, name)

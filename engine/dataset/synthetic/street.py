@@ -1,4 +1,4 @@
-"""A street of 112 m between two rows of houses, with trees and large objects on its pavements, in sunshine.
+"""A street between two rows of houses, with trees and large objects on its pavements, in sunshine.
 
 The world is in metres with z up; the street runs along x, its middle is y = 0, the ground the plane z = 0.
 """
@@ -42,10 +42,8 @@ from octasplat.engine.dataset.synthetic.street_albedo import (
     street_ground,
 )
 
-HOUSES = 8
-"""On each side."""
 LOT = 14.0
-HALF_LENGTH = 0.5 * HOUSES * LOT
+"""What each house takes of the street's length."""
 FACADE_Y = 9.0
 _WIDTH, _DEPTH = 5 * WINDOW_STEP, 4 * WINDOW_STEP
 _CELL = 0.35
@@ -98,15 +96,23 @@ def _house_meshes(storeys: int, rise: float) -> tuple[TexturedMesh, TexturedMesh
     return join_meshes(walls), join_meshes(roof)
 
 
-def _houses(side: float) -> list[SceneObject]:
+def half_length(houses: int) -> float:
+    """Return half of the length of a street with so many houses on each side, metres."""
+    return 0.5 * houses * LOT
+
+
+def _houses(side: float, houses: int) -> list[SceneObject]:
     """Return the houses of the side of ``side`` times y."""
     made = []
-    for k in range(HOUSES):
-        number = k + (HOUSES if side < 0 else 0)
+    for k in range(houses):
+        number = k + (houses if side < 0 else 0)
         storeys, rise = 2 + (5 * number // 3) % 2, 2.2 + 0.4 * (number % 4)
         walls, roof = _house_meshes(storeys, rise)
         turn = rotation_z(0.0 if side > 0 else 180.0)
-        place = (-HALF_LENGTH + LOT * (k + 0.5), side * (FACADE_Y + 0.5 * _DEPTH + 0.6 * (number % 3)))
+        place = (
+            -half_length(houses) + LOT * (k + 0.5),
+            side * (FACADE_Y + 0.5 * _DEPTH + 0.6 * (number % 3)),
+        )
         low = float(roof.vertices[:, 2].min())
         made += [
             SceneObject(f"house {number}", place_mesh(walls, turn, *place, 0.0), facade(number, storeys)),
@@ -120,14 +126,14 @@ def _scaled(mesh: TexturedMesh, factor: float) -> TexturedMesh:
     return replace(mesh, vertices=mesh.vertices * np.float32(factor))
 
 
-def _trees(side: float) -> list[SceneObject]:
+def _trees(side: float, houses: int) -> list[SceneObject]:
     trunk_profile = np.array([[0.26, 0.0], [0.17, 0.5], [0.14, 1.6], [0.12, 2.6], [0.05, 3.2]])
     trunk = surface_of_revolution(catmull_rom_profile(trunk_profile, 4), columns=20)
     crown = boulder_mesh(1.7, 0.55, 96, 64)
     made = []
-    for k in range(HOUSES - 1):
+    for k in range(houses - 1):
         number = 2 * k + (side < 0)
-        x, y = -HALF_LENGTH + LOT * (k + 1), side * 8.2
+        x, y = -half_length(houses) + LOT * (k + 1), side * 8.2
         placed = place_mesh(trunk, np.eye(3), x, y, 0.0)
         made.append(SceneObject(f"trunk {number}", placed, albedo.pedestal_wood))
         size = 0.85 + 0.1 * (number % 4)
@@ -136,7 +142,7 @@ def _trees(side: float) -> list[SceneObject]:
     return made
 
 
-def _monuments(side: float) -> list[SceneObject]:
+def _monuments(side: float, houses: int) -> list[SceneObject]:
     """Return objects like those of the still life, large, one before each house."""
     tower = twisted_tower_mesh(0.125, 0.66, np.radians(70), 0.62, 24)
     kinds: tuple[tuple[str, TexturedMesh, Callable[[np.ndarray, np.ndarray], np.ndarray], float], ...] = (
@@ -147,9 +153,9 @@ def _monuments(side: float) -> list[SceneObject]:
         ("cube", _scaled(superquadric_mesh(0.15, 7.0, 96, 72), 3.2), albedo.cube_paint, 0.0),
     )  # fmt: skip
     made = []
-    for k in range(HOUSES):
+    for k in range(houses):
         name, mesh, material, specular = kinds[(k + (2 if side < 0 else 0)) % len(kinds)]
-        x, y = -HALF_LENGTH + LOT * (k + 0.5) + 3.1 * (-1) ** k, side * 6.1
+        x, y = -half_length(houses) + LOT * (k + 0.5) + 3.1 * (-1) ** k, side * 6.1
         placed = place_mesh(mesh, rotation_z(40.0 * k + 15.0), x, y, 0.0)
         label = f"{name} {k} {'left' if side > 0 else 'right'}"
         made.append(SceneObject(label, placed, material, specular=specular))
@@ -157,14 +163,14 @@ def _monuments(side: float) -> list[SceneObject]:
 
 
 @lru_cache(maxsize=1)
-def build_street() -> ObjectScene:
-    """Build the street; it has no parameters and is always the same."""
-    reach, across = HALF_LENGTH + 20.0, 30.0
+def build_street(houses: int) -> ObjectScene:
+    """Build the street with so many houses on each side; it has no other parameters."""
+    reach, across = half_length(houses) + 20.0, 30.0
     near = flat_patch(
         (-reach, -across, 0.0), (2 * reach, 0.0, 0.0), (0.0, 2 * across, 0.0), round(2 * reach / 0.4), 150
     )
     far = flat_patch((-400.0, -400.0, -0.05), (800.0, 0.0, 0.0), (0.0, 800.0, 0.0), 80, 80)
     objects = [SceneObject("ground", near, street_ground), SceneObject("far ground", far, street_ground)]
     for side in (1.0, -1.0):
-        objects += [*_houses(side), *_trees(side), *_monuments(side)]
+        objects += [*_houses(side, houses), *_trees(side, houses), *_monuments(side, houses)]
     return join_objects(objects, _SUN, _SKY_DISTANCE)

@@ -7,6 +7,7 @@ import pycolmap
 from jaxtyping import Float, Float32
 
 from octasplat.engine.dataset.synthetic.config import SyntheticDatasetConfig
+from octasplat.engine.dataset.synthetic.street import half_length
 
 # (share of the views, distance from the table's axis, height above the table), metres.
 _RINGS = ((0.4, 2.45, 0.5), (0.35, 2.25, 1.05), (0.25, 1.75, 1.75))
@@ -14,7 +15,8 @@ _TARGET_WORLD = np.array([0.0, 0.0, 0.16])
 _HALF_FOV = np.radians(27)
 # Of the walks along the street: directions of a station in degrees from +x to the other side, and pitches.
 _YAWS, _PITCHES = (20.0, 65.0, 115.0, 160.0), (3.0, 14.0)
-_WALK_HALF_LENGTH = 52.0
+_WALK_END = 4.0
+"""From the last station to the end of the street, metres."""
 
 
 @dataclass(frozen=True)
@@ -79,10 +81,11 @@ def _street_views(config: SyntheticDatasetConfig) -> list[SyntheticView]:
     random = np.random.default_rng([config.seed, 1])
     each = len(_YAWS)
     stations = -(-config.views // (2 * each))
+    walk = half_length(config.houses) - _WALK_END
     made: list[SyntheticView] = []
     for station in range(stations):
         for lane in (-1.0, 1.0):
-            x = _WALK_HALF_LENGTH * ((2 * station + 1 + 0.5 * lane) / stations - 1)
+            x = walk * ((2 * station + 1 + 0.5 * lane) / stations - 1)
             y = lane * random.uniform(2.1, 2.7)
             centre = np.array([x + random.uniform(-0.2, 0.2), y, random.uniform(1.5, 1.8)])
             for place, yaw in enumerate(_YAWS):

@@ -13,20 +13,18 @@ from octasplat.engine.dataset.synthetic.points import sample_surface_points
 from octasplat.engine.dataset.synthetic.still_life import build_still_life
 from octasplat.engine.dataset.synthetic.street import build_street
 
-_BUILDERS = {"still_life": build_still_life, "street": build_street}
-
 
 @lru_cache(maxsize=1)
-def cached_lit_scene(name: str) -> LitScene:
+def cached_lit_scene(name: str, houses: int) -> LitScene:
     """Return the lit scene of a name; cached, because lighting it takes longer than a photograph."""
-    return LitScene(_BUILDERS[name]())
+    return LitScene(build_street(houses) if name == "street" else build_still_life())
 
 
 def write_dataset_files(
     root: Path, config: SyntheticDatasetConfig, progress: Callable[[int, int], None]
 ) -> None:
     """Write images, model and ground truth under ``root``; ``progress`` counts photographs."""
-    scene = cached_lit_scene(config.scene)
+    scene = cached_lit_scene(config.scene, config.houses)
     camera, views = synthetic_views.synthetic_camera(config), synthetic_views.synthetic_views(config)
     truth = root / "ground_truth"
     folders = [root / "images", truth / "depth", truth / "normals", truth / "masks"]

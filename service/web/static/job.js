@@ -142,6 +142,7 @@ async function followLog() {
         if (fold.open && !document.hidden) {
             try {
                 const response = await fetch(`${api}/logs?after=${after}&limit=2000`);
+                if (!response.ok) throw new Error(String(response.status));
                 const page = await response.json();
                 after = page.next;
                 const atEnd = log.scrollTop + log.clientHeight >= log.scrollHeight - 30;
@@ -160,8 +161,9 @@ document.addEventListener("job-changed", ({ detail }) => {
     // A retried job has a life ahead of it again.
     if (isOver(about.dataset.state) !== isOver(detail.state)) location.reload();
 });
-document.getElementById("log-fold").addEventListener("toggle", followLog, { once: true });
-if (document.getElementById("log-fold").open) followLog();
+const logFold = document.getElementById("log-fold");
+if (logFold.open) followLog();
+else logFold.addEventListener("toggle", followLog, { once: true });
 readPast().catch(() => {}).then(() => {
     charts?.update();
     if (!isOver(about.dataset.state)) listen();

@@ -1,6 +1,7 @@
 // The page of a new job: photographs are chosen or dropped, sent, and their reconstruction is queued.
 
 import { showEstimates } from "./estimate.js";
+import { shortName } from "./file_names.js";
 import { fillOptions, followPreset, queueJob, readOptions } from "./options.js";
 import { chosenFiles, droppedFiles, scenesOf } from "./scene_files.js";
 import { Upload } from "./upload.js";
@@ -168,7 +169,7 @@ async function startOne(scene, label, isOneOfMany) {
     }
     const body = { kind, dataset_id: id, options: readOptions(form), queue: find("queue")?.value ?? "cpu" };
     if (find("begin-with")?.checked) body.source_id = find("begin-with").value;
-    if (label) body.label = isOneOfMany ? `${label}: ${scene.title}` : label;
+    if (label) body.label = isOneOfMany ? shortName(`${label}: ${scene.title}`) : label;
     return queueJob(body, `page-${id}-${Date.now()}`);
 }
 

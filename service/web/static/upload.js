@@ -1,9 +1,12 @@
 // Sends a scene file by file, each with its digest; what has arrived before is not sent again.
 
+import { shortName } from "./file_names.js";
+import { LARGE_BYTES, base64, hex, sendInParts } from "./large_file.js";
 import { answer } from "./options.js";
 
 const PARALLEL = 4;
 const TRIES = 6;
+const BATCH_FILES = 200, BATCH_BYTES = 64 << 20; // looked at together, while those before them are sent
 
 /** An upload that can be paused, goes on by itself after a break, and with the next choice of the same files. */
 export class Upload {
@@ -17,6 +20,8 @@ export class Upload {
         Object.assign(this, { scene, title, tell, holds });
         this.sent = new Map(); // bytes by name
         this.running = new Set();
+        this.places = PARALLEL; // requests that may be begun
+        this.waiting = [];
         this.paused = null;
         this.worker = new Worker(new URL("./digest_worker.js", import.meta.url), { type: "module" });
         this.asked = new Map();
@@ -37,7 +42,7 @@ export class Upload {
             if (dataset.state === "open") {
                 const arrived = archive ? new Map() : await this.arrived(dataset.id);
                 if (!archive) await this.removeOthers(dataset.id, arrived, items);
-                await this.sendAll(items, (item) => archive ? `/v1/datasets/${dataset.id}/archive` : address(dataset.id, item.name), arrived);
+                await this.sendAll(dataset.id, items, arrived);
                 this.report("checking");
             }
             const { id } = dataset;
@@ -69,7 +74,7 @@ export class Upload {
         const make = (key) => fetch("/v1/datasets", {
             method: "POST",
             headers: { "Content-Type": "application/json", "Idempotency-Key": key },
-            body: JSON.stringify({ name: this.title, holds: this.holds }),
+            body: JSON.stringify({ name: shortName(this.title), holds: this.holds }),
         }).then(answer);
         try {
             return await this.again(() => make(key));
@@ -97,15 +102,27 @@ export class Upload {
         }
     }
 
-    async sendAll(items, addressOf, arrived) {
+    async sendAll(id, items, arrived) {
         this.items = items;
         this.finished = 0;
-        const waiting = [...items];
+        const batches = batchesOf(items), looked = [];
+        const waiting = batches.flatMap((batch, number) => batch.map((item) => [item, number]));
+        const look = (number) => {
+            if (!looked[number]) { // after the one before, so that what is sent first is read first
+                const before = looked[number - 1]?.catch(() => {});
+                looked[number] = (async () => { await before; return this.lookAt(id, batches[number], arrived); })();
+                looked[number].catch(() => {}); // told where it is waited for
+            }
+            return looked[number];
+        };
         this.report("sending");
         const work = async () => {
-            for (let item = waiting.shift(); item; item = waiting.shift()) {
-                const sha256 = await this.digest(item.file);
-                if (arrived.get(item.name)?.sha256 !== hex(sha256)) await this.again(() => this.put(addressOf(item), item, sha256));
+            for (let next = waiting.shift(); next; next = waiting.shift()) {
+                const [item, number] = next;
+                const digests = look(number);
+                if (number + 1 < batches.length) look(number + 1);
+                const { sha256, isThere } = (await digests).get(item.name);
+                if (!isThere) await this.send(id, item, sha256);
                 this.sent.set(item.name, item.file.size);
                 this.finished += 1;
                 this.report("sending");
@@ -120,27 +137,75 @@ export class Upload {
         }
     }
 
-    put(url, { name, file }, sha256) {
+    /** The digest of each file of a batch, and whether the dataset has it: from before, or from another one of its owner. */
+    async lookAt(id, batch, arrived) {
+        const found = new Map();
+        for (const { name, file } of batch) {
+            const sha256 = await this.digest(file);
+            found.set(name, { sha256, isThere: arrived.get(name)?.sha256 === hex(sha256) });
+        }
+        const lacking = [...found].filter(([name, { isThere }]) => !isThere && name !== this.scene.archive?.name);
+        if (!lacking.length) return found;
+        const files = lacking.map(([path, { sha256 }]) => ({ path, sha256: hex(sha256) }));
+        try {
+            const reused = await this.again(() => fetch(`/v1/datasets/${id}/files`, {
+                method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ files }),
+            }).then(answer));
+            reused.files.forEach(({ path }) => { found.get(path).isThere = true; });
+        } catch (error) {
+            if (![404, 405].includes(error.status)) throw error; // a front end of the former version is asked
+        }
+        return found;
+    }
+
+    async send(id, { name, file }, sha256) {
+        const isArchive = file === this.scene.archive;
+        const tell = (bytes) => {
+            this.sent.set(name, bytes);
+            this.report("sending");
+        };
+        try {
+            if (file.size >= LARGE_BYTES) await sendInParts(this, id, isArchive ? null : name, file, sha256, tell);
+            else await this.again(() => this.put(isArchive ? `/v1/datasets/${id}/archive` : address(id, name), file, sha256, tell));
+        } catch (error) {
+            error.faults = error.faults?.length ? error.faults : [`${name}: ${error.message}`];
+            throw error;
+        }
+    }
+
+    /** Send a content with its digest, when there is a place for it; returns {location} of the answer. */
+    async put(url, content, sha256, tell) {
+        while (!this.places) await new Promise((resolve) => this.waiting.push(resolve));
+        this.places -= 1;
+        try {
+            if (this.paused) throw new TypeError("The upload is paused.");
+            return await this.putNow(url, content, sha256, tell);
+        } finally {
+            this.places += 1;
+            this.waiting.shift()?.();
+        }
+    }
+
+    putNow(url, content, sha256, tell) {
         return new Promise((resolve, reject) => {
             const request = new XMLHttpRequest(); // fetch does not tell how much has gone out
             this.running.add(request);
             request.open("PUT", url);
             request.setRequestHeader("Content-Type", "application/octet-stream");
             request.setRequestHeader("Repr-Digest", `sha-256=:${base64(sha256)}:`);
-            request.upload.onprogress = ({ loaded }) => {
-                this.sent.set(name, loaded);
-                this.report("sending");
-            };
-            request.onload = () => answer(new Response(request.responseText || "{}", { status: request.status })).then(resolve, (error) => {
-                error.faults = error.faults?.length ? error.faults : [`${name}: ${error.message}`];
+            request.upload.onprogress = ({ loaded }) => tell(loaded);
+            const fail = (error) => {
+                tell(0); // before it is told that the connection is lost
                 reject(error);
-            });
-            request.onerror = request.onabort = () => reject(new TypeError("The connection broke off."));
-            request.onloadend = () => {
-                this.running.delete(request);
-                if (request.status < 200 || request.status > 299) this.sent.delete(name);
             };
-            request.send(file);
+            request.onload = () => {
+                const isGood = request.status >= 200 && request.status < 300;
+                if (isGood) resolve({ location: request.getResponseHeader("Location") });
+                else answer(new Response(request.responseText || "{}", { status: request.status })).catch(fail);
+            };
+            request.onerror = request.onabort = () => fail(new TypeError("The connection broke off."));
+            request.onloadend = () => this.running.delete(request);
+            request.send(content);
         });
     }
 
@@ -182,10 +247,17 @@ function address(id, name) {
     return `/v1/datasets/${id}/files/${name.split("/").map(encodeURIComponent).join("/")}`;
 }
 
-function hex(bytes) {
-    return [...bytes].map((byte) => byte.toString(16).padStart(2, "0")).join("");
-}
-
-function base64(bytes) {
-    return btoa(String.fromCharCode(...bytes));
+/** Items in groups of which none takes long to read. */
+function batchesOf(items) {
+    const batches = [];
+    let bytes = 0;
+    for (const item of items) {
+        if (!batches.length || batches.at(-1).length >= BATCH_FILES || bytes + item.file.size > BATCH_BYTES) {
+            batches.push([]);
+            bytes = 0;
+        }
+        batches.at(-1).push(item);
+        bytes += item.file.size;
+    }
+    return batches;
 }

@@ -9,9 +9,16 @@ from octasplat.workers.cli.printing import Printer, output_options
 
 
 class _SizeNumber(click.ParamType[int]):
-    """A number, also with k, M, G or T."""
+    """A number, also with k, M, G or T.
+
+    Args:
+        most: that the column of the table holds.
+    """
 
     name = "number"
+
+    def __init__(self, most: int) -> None:
+        self._most = most
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
         if isinstance(value, int):
@@ -19,16 +26,18 @@ class _SizeNumber(click.ParamType[int]):
         units = {"k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12}
         text = str(value).strip().lower()
         number, unit = (text[:-1], units[text[-1]]) if text[-1:] in units else (text, 1)
-        if not number.isdigit():
+        if not (number.isascii() and number.isdigit() and len(number) < 20):
             self.fail(f"{value} is not a number such as 500, 20G or 1T", param, ctx)
+        if int(number) * unit > self._most:
+            self.fail(f"{value} is more than {self._most}", param, ctx)
         return int(number) * unit
 
 
 @click.command(short_help="Show or set what an owner may take.")
 @click.argument("owner")
-@click.option("--bytes", "max_bytes", type=_SizeNumber(), help="Contents stored, e.g. 20G.")
-@click.option("--datasets", "max_datasets", type=_SizeNumber(), help="Datasets.")
-@click.option("--jobs", "max_jobs", type=_SizeNumber(), help="Jobs that are queued or running.")
+@click.option("--bytes", "max_bytes", type=_SizeNumber(2**63 - 1), help="Contents stored, e.g. 20G.")
+@click.option("--datasets", "max_datasets", type=_SizeNumber(2**31 - 1), help="Datasets.")
+@click.option("--jobs", "max_jobs", type=_SizeNumber(2**31 - 1), help="Jobs that are queued or running.")
 @click.option(
     "--share",
     type=click.FloatRange(0.01, 100),

@@ -3,6 +3,9 @@
 import { Vector3 } from "../vendor/three.js";
 
 const CLICK_PX = 5;
+const TRIES = 5;
+
+const same = (one, other) => one.text === other.text && String(one.position) === String(other.position);
 
 export class Marks {
     /** @param viewer has the box, canvas, camera, controls, overlay, pick(x, y), wake(), goTo(position, target). */
@@ -70,20 +73,32 @@ export class Marks {
         const { camera, controls } = this.viewer;
         const input = this.form.querySelector("input");
         const note = { text: input.value.trim(), position: this.point, camera: [...camera.position.toArray(), ...controls.target.toArray()] };
-        if (await this.store([...this.notes, note])) {
+        if (await this.store((notes) => [...notes, note])) {
             input.value = "";
             this.form.hidden = true;
             this.toggle("note");
         }
     }
 
-    async store(notes) {
+    /** Changes the notes that the job has by now: others may have written some since this page was loaded. */
+    async store(change) {
         const { box, place } = this.viewer;
-        const response = await fetch(`/v1/jobs/${box.dataset.job}`, {
-            method: "PATCH", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ view_notes: notes }),
-        }).catch(() => null);
-        if (response?.ok) this.notes = notes;
-        else place.textContent = (await response?.json().catch(() => null))?.detail ?? "The note was not kept.";
+        const address = `/v1/jobs/${box.dataset.job}`;
+        let response = null;
+        for (let left = TRIES; left > 0 && (response === null || response.status === 412); left -= 1) {
+            response = await fetch(address).catch(() => null);
+            if (!response?.ok) break;
+            const { view_notes: notes } = await response.json();
+            response = await fetch(address, {
+                method: "PATCH",
+                headers: { "Content-Type": "application/json", "If-Match": response.headers.get("ETag") },
+                body: JSON.stringify({ view_notes: change(notes) }),
+            }).catch(() => null);
+            if (response === null) break;
+        }
+        const answered = await response?.json().catch(() => null);
+        if (response?.ok) this.notes = answered.view_notes;
+        else place.textContent = answered?.detail ?? "The note was not kept.";
         this.showNotes();
         return Boolean(response?.ok);
     }
@@ -92,7 +107,7 @@ export class Marks {
         const mayChange = this.viewer.box.querySelector("[data-do=note]") !== null;
         this.viewer.overlay.notes = this.notes;
         this.list.hidden = !this.notes.length;
-        this.list.replaceChildren(...this.notes.map((note, k) => {
+        this.list.replaceChildren(...this.notes.map((note) => {
             const item = document.createElement("li");
             const go = Object.assign(document.createElement("button"), { type: "button", className: "plain", textContent: note.text, title: "Look at it" });
             go.addEventListener("click", () => this.viewer.goTo(note.camera.slice(0, 3), new Vector3().fromArray(note.camera, 3)));
@@ -100,7 +115,7 @@ export class Marks {
             if (mayChange) {
                 const remove = Object.assign(document.createElement("button"), { type: "button", className: "plain", textContent: "×" });
                 remove.setAttribute("aria-label", `Remove the note ${note.text}`);
-                remove.addEventListener("click", () => this.store(this.notes.filter((_note, other) => other !== k)));
+                remove.addEventListener("click", () => this.store((notes) => notes.filter((other) => !same(note, other))));
                 item.append(" ", remove);
             }
             return item;
