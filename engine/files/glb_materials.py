@@ -21,8 +21,7 @@ SUPPORTED_EXTENSIONS = ("clearcoat", "emissive_strength", "ior", "transmission",
 SUFFIXES = {"image/png": ".png", "image/jpeg": ".jpg", "image/webp": ".webp"}
 KINDS = {b"\x89PNG": ".png", b"\xff\xd8\xff": ".jpg", b"RIFF": ".webp"}
 PARTLY_SUPPORTED_EXTENSIONS = {
-    "clearcoatNormalTexture", "clearcoatRoughnessTexture", "clearcoatTexture", "thicknessTexture",
-    "transmissionTexture",
+    "clearcoatNormalTexture", "thicknessTexture", "transmissionTexture"
 }  # fmt: skip
 
 
@@ -61,11 +60,14 @@ def texture_frame(material: Mapping[str, Any]) -> tuple[int, Float64[np.ndarray,
 def _texture_infos(material: Mapping[str, Any]) -> dict[str, Any]:
     """Return the texture references of a material by name, base color first."""
     shading = material.get("pbrMetallicRoughness", {})
+    coat = material.get("extensions", {}).get("KHR_materials_clearcoat", {})
     found = {
         "texture": shading.get("baseColorTexture"),
         "metallic_roughness_texture": shading.get("metallicRoughnessTexture"),
         "normal_texture": material.get("normalTexture"),
         "emission_texture": material.get("emissiveTexture"),
+        "clear_coat_texture": coat.get("clearcoatTexture"),
+        "clear_coat_roughness_texture": coat.get("clearcoatRoughnessTexture"),
     }
     return {name: info for name, info in found.items() if info is not None}
 
@@ -103,7 +105,7 @@ class _MaterialReader:
             absorption=self._absorption_coefficients(),
             clear_coat=float(extensions.get("clearcoat", {}).get("clearcoatFactor", 0.0)),
             clear_coat_roughness=float(extensions.get("clearcoat", {}).get("clearcoatRoughnessFactor", 0.0)),
-            **self._opacity(base[3], images.get("texture")),
+            **self._opacity(number, base[3], images.get("texture")),
             unsupported=self._unsupported_features(number),
             **images,  # type: ignore[arg-type]
         )
@@ -123,13 +125,18 @@ class _MaterialReader:
     def _alpha_mode(self) -> str:
         return str(self._material.get("alphaMode", "OPAQUE"))
 
-    def _opacity(self, factor: float, texture: FileImage | None) -> dict[str, Any]:
+    def _opacity(self, number: int, factor: float, texture: FileImage | None) -> dict[str, Any]:
         """Return what of a :class:`MeshMaterial` says where the surface is, by its alpha."""
         mode = self._alpha_mode()
         if mode not in ("MASK", "BLEND"):
             return {}
         cutoff = float(self._material.get("alphaCutoff", 0.5)) if mode == "MASK" else None
-        return {"opacity": factor, "opacity_texture": texture, "opacity_cutoff": cutoff}
+        return {
+            "opacity": factor,
+            "opacity_texture": texture,
+            "opacity_cutoff": cutoff,
+            "uses_vertex_alpha": self._has_vertex_alpha(number),
+        }
 
     def _has_vertex_alpha(self, number: int) -> bool:
         """Return whether some vertices with this material have colors with an alpha below 1."""
@@ -153,8 +160,6 @@ class _MaterialReader:
         mode = self._alpha_mode()
         if mode not in ("OPAQUE", "MASK", "BLEND"):
             found.append(f"alphaMode {mode}")
-        if mode in ("MASK", "BLEND") and self._has_vertex_alpha(number):
-            found.append("the alpha of vertices")
         if "occlusionTexture" in material:
             found.append("occlusionTexture")
         for values in self._extensions.values():

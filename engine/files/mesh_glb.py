@@ -58,6 +58,7 @@ CORES_OF_CHUNKS, CORES_IN_ORDER = 0.3, 0.5
 """From which alpha on octagons are drawn solid for viewers, in chunks and in one order
 (docs/opening/threejs.md)."""
 ATTRIBUTES = {"uv": "TEXCOORD_0", "gid": "_GID", "corner": "_CORNER", "radius": "_RADIUS"}
+MATERIAL_ATTRIBUTES = {"normal": "NORMAL", "color": "COLOR_0", "alpha": "COLOR_0"}
 ATTRIBUTE_WIDTHS = {"uv": 2, "normal": 3, "color": 3}
 ChunkIndices = list[Int[np.ndarray, "_"]]
 
@@ -105,7 +106,7 @@ def _read_triangles(file: GlbFile, *, with_materials: bool) -> tuple[ImportedMes
     vertices: list[np.ndarray] = []
     triangles: list[np.ndarray] = []
     numbers: list[np.ndarray] = []
-    names = ATTRIBUTES | ({"normal": "NORMAL", "color": "COLOR_0"} if with_materials else {})
+    names = ATTRIBUTES | (MATERIAL_ATTRIBUTES if with_materials else {})
     extras: dict[str, list[np.ndarray]] = {key: [] for key in names}
     count = 0
     for matrix, primitive in file.primitives():
@@ -135,6 +136,8 @@ def _read_triangles(file: GlbFile, *, with_materials: bool) -> tuple[ImportedMes
                     values = values @ np.linalg.inv(matrix[:3, :3])  # n' = M^-T n, in rows
                 elif key == "uv" and with_materials:
                     values = values @ turn[:, :2].T + turn[:, 2]
+                elif key == "alpha":
+                    values = values[:, 3:] if values.shape[1] == 4 else np.full((size, 1), np.nan)
                 extras[key].append(values[:, : ATTRIBUTE_WIDTHS.get(key, 1)].astype(np.float32))
             else:
                 extras[key].append(np.full((size, ATTRIBUTE_WIDTHS.get(key, 1)), np.nan, np.float32))
@@ -158,6 +161,7 @@ def _read_triangles(file: GlbFile, *, with_materials: bool) -> tuple[ImportedMes
         scene_size=scene_size_of(stated.get(SCENE_SIZE_KEY)),
         normals=joined.get("normal"),
         rgb_linear=joined.get("color"),
+        alpha=_flatten_scalar(joined.get("alpha")),
     )
     return mesh, np.concatenate([*numbers, np.zeros(0, np.int32)])
 

@@ -171,8 +171,12 @@ def _vertex_lines(batch: OctagonBatch) -> str:
     return vertices + TEXTURE_LINE * (count * SIDES) % tuple(batch.uv.reshape(-1).tolist())
 
 
-def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
+def write_surface(
+    mesh: TriangleMesh, path: Path, _turn_xyzw: Sequence[float] | None = None
+) -> tuple[Path, ...]:
     """Write a surface; vertex colors stand behind the positions, a texture in an MTL and a PNG beside it.
+
+    It stays in the frame of the scene.
 
     Raises:
         OSError: a file cannot be written.

@@ -3,7 +3,7 @@
 Octagons: the format to edit in, as mesh editors keep vertex attributes both ways; they are found by name.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -187,8 +187,10 @@ def _face_batches(count: int) -> Iterator[np.ndarray]:
         yield _face_rows(octagon_triangles(min(BATCH_SIZE, count - start)) + start * SIDES)
 
 
-def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
-    """Write a surface with its normals and the colors of its vertices, if it has some.
+def write_surface(
+    mesh: TriangleMesh, path: Path, _turn_xyzw: Sequence[float] | None = None
+) -> tuple[Path, ...]:
+    """Write a surface with its normals and the colors of its vertices, if it has some, in the scene's frame.
 
     Raises:
         SceneFileError: the file cannot be written.

@@ -4,7 +4,7 @@ A format is a module of this package that holds all that can be done with it and
 else has to know of it.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, TypeVar
@@ -29,6 +29,7 @@ def no_files(_path: Path) -> tuple[Path, ...]:
 
 SceneReader = Callable[[Path], GaussianCloud]
 SceneWriter = Callable[[FlatGaussians, Path, ExportOptions], tuple[Path, ...]]
+MeshWriter = Callable[[TriangleMesh, Path, Sequence[float] | None], tuple[Path, ...]]
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,9 @@ class SurfaceWriter(Entry):
     Attributes:
         name: of the format.
         patterns: file names that it takes.
-        write: writes the surface and returns every file written, the path itself first.
+        write: writes the surface and returns every file written, the path itself first. The quaternion (x, y,
+            z, w) turns the scene upright, y up; None is half a turn about x. Formats that keep the scene's
+            frame pass over it.
         textured: whether it can hold a texture.
         lit: whether it can hold materials.
         missing_requirement: see :class:`Exporter`.
@@ -116,7 +119,7 @@ class SurfaceWriter(Entry):
     """
 
     noun: ClassVar[str] = "surface"
-    write: Callable[[TriangleMesh, Path], tuple[Path, ...]]
+    write: MeshWriter
     textured: bool
     lit: bool = False
     missing_requirement: Callable[[], str | None] = lambda: None

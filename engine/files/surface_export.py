@@ -1,23 +1,19 @@
 """Surfaces among the files that a scene is exported to: textured, opaque triangles as GLB or USDZ."""
 
-from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.files import glb_surface, usdz_surface
 from octasplat.engine.files.export_options import ExportOptions
-from octasplat.engine.files.registry import Exporter, SceneWriter, register
+from octasplat.engine.files.registry import Exporter, MeshWriter, SceneWriter, register
 from octasplat.engine.files.usd_stage import missing_usd
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 
 SURFACE_FORMATS = ("surface", "surface-usdz")
 """Names of the exporters of this module."""
 
 
-def _writer(
-    write_surface: Callable[[TriangleMesh, Path, Sequence[float] | None], tuple[Path, ...]],
-) -> SceneWriter:
+def _writer(write_surface: MeshWriter) -> SceneWriter:
     """Return a writer of the surface that the options make.
 
     It raises SceneFileError where they make none, or where the surface is too large.

@@ -120,14 +120,22 @@ def surface_files(path: Path, *, textured: bool) -> tuple[Path, ...]:
     return (path, *(writer.beside(path) if textured else ()))
 
 
-def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
+def write_surface(
+    mesh: TriangleMesh, path: Path, turn_xyzw: Sequence[float] | None = None
+) -> tuple[Path, ...]:
     """Write ``mesh`` as its suffix says, and return every file written, ``path`` first.
 
     GLB: unlit, the colors being those of the photographs with their light; normals are there for who wants
-    to light it anew. Its root node turns COLMAP's frame to glTF's. With materials it is lit, and the node
-    turns the light's up to glTF's. USDZ likewise, but a georeference says its place and its metres. PLY and
+    to light it anew. Its root node turns the scene upright. With materials it is lit, and the node turns the
+    light's up to glTF's. USDZ likewise, but a georeference says its place and its metres. PLY and
     OBJ keep the world frame. OBJ with vertex colors writes them behind the positions; with a texture, an MTL
     and a PNG lie beside it.
+
+    Args:
+        mesh: the surface.
+        path: the file.
+        turn_xyzw: rotation (x, y, z, w) that turns the scene upright, y up; None is half a turn about x,
+            which brings COLMAP's frame to glTF's.
 
     Raises:
         ConfigError: the suffix does not fit.
@@ -135,7 +143,7 @@ def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
     """
     writer = _surface_writer(path, mesh.texture_srgb is not None, mesh.materials is not None)
     try:
-        return writer.write(mesh, path)
+        return writer.write(mesh, path, turn_xyzw)
     except OSError as error:
         raise SceneFileError(f"{path}: cannot be written ({error.strerror or error}).") from error
 

@@ -30,6 +30,7 @@ class ImportedMesh:
             upper left, NaN where there are none; None without any.
         normals: likewise, of the vertices, NaN where there are none; None without any.
         rgb_linear: likewise, colors of the vertices.
+        alpha: likewise, the alpha of these colors, NaN where a vertex has none.
         material_indices: likewise, row of each triangle in ``materials``, -1 for none.
         materials: likewise, those that the file gives.
     """
@@ -47,6 +48,7 @@ class ImportedMesh:
     corner_uv: Float32[np.ndarray, "t 3 2"] | None = None
     normals: Float32[np.ndarray, "v 3"] | None = None
     rgb_linear: Float32[np.ndarray, "v 3"] | None = None
+    alpha: Float32[np.ndarray, " v"] | None = None
     material_indices: Int32[np.ndarray, " t"] | None = None
     materials: tuple[MeshMaterial, ...] = ()
 

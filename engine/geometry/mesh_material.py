@@ -44,8 +44,11 @@ class MeshMaterial:
         opacity: share of the surface that is there.
         opacity_texture: alpha, multiplied by it; of an image other than ``texture`` that has none its grey.
         opacity_cutoff: the surface is there where the opacity reaches this; None where it covers in part.
+        uses_vertex_alpha: whether the alpha of the vertices' colors is multiplied by the opacity.
         clear_coat: share of the surface under a clear coat.
+        clear_coat_texture: multiplied by it, in red.
         clear_coat_roughness: perceptual.
+        clear_coat_roughness_texture: multiplied by it, in green.
         unsupported: what else the file says of it, which is not understood, in words.
     """
 
@@ -65,8 +68,11 @@ class MeshMaterial:
     opacity: float = 1.0
     opacity_texture: FileImage | None = None
     opacity_cutoff: float | None = None
+    uses_vertex_alpha: bool = False
     clear_coat: float = 0.0
+    clear_coat_texture: FileImage | None = None
     clear_coat_roughness: float = 0.0
+    clear_coat_roughness_texture: FileImage | None = None
     unsupported: tuple[str, ...] = ()
 
 

@@ -165,6 +165,7 @@ def run(
     from octasplat.engine.render.shots import camera_shots
     from octasplat.engine.runs.config import read_config
     from octasplat.engine.runs.run_folder import CONFIG, SCENE, is_full_run, is_run
+    from octasplat.engine.shading.recipes import material_shading
 
     report = stop_when_asked(progress, should_stop)
     for sentence in request.unused():
@@ -177,6 +178,13 @@ def run(
     scene_file = request.source / SCENE if is_run(request.source) else request.source
     require_materials(source.gaussians, scene_file)
     learnt = read_config(request.source / CONFIG).train.materials if of_run else None
+    if learnt is not None and material_shading(learnt.recipe).albedo_holds_light:
+        report(
+            Warned(
+                f"{request.source} was trained with materials.recipe={learnt.recipe}: base colors of what "
+                "does not reflect hold the light of the photographs."
+            )
+        )
     up = light_up(request.source, request.up)
     cameras = None if request.other_dataset is not None else requested_cameras(request, source)
     views, shots = _selected_views(request, source) if cameras is None else (None, camera_shots(cameras))

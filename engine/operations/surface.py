@@ -234,6 +234,7 @@ def run(
     from octasplat.engine.operations.written_files import check_targets
     from octasplat.engine.runs.run_folder import SCENE, is_run
     from octasplat.engine.runs.surface_inputs import depth_cameras
+    from octasplat.engine.runs.viewer_glb import upright_turn
     from octasplat.engine.shading.environment_frame import environment_frame
     from octasplat.engine.surface.bake_materials import material_features
     from octasplat.engine.surface.extract import extract_levels
@@ -259,6 +260,7 @@ def run(
         features, frame = material_features(gaussians), environment_frame(light_up(source, request.up))
         light = _light_to_copy(source, output)  # refused before the long work if another one lies there
     cameras, settings = depth_cameras(source, request.dataset, gaussians, request.depth_side)
+    turn = upright_turn(source, request.dataset)
     try:
         # the depth maps' file goes there, long before the surface
         output.parent.mkdir(parents=True, exist_ok=True)
@@ -280,7 +282,7 @@ def run(
     )
     place: dict[str, Any] = {"origin_world": facts.origin_world, "georeference": facts.georeference}
     levels = tuple(
-        _surface_level(surface, write_surface(replace(surface.mesh, **place), path))
+        _surface_level(surface, write_surface(replace(surface.mesh, **place), path, turn))
         for surface, path in zip(surfaces, request.outputs, strict=True)
     )
     environment = None if light is None else _copy_light(light, output)

@@ -155,7 +155,8 @@ def compile_meshes(
     )
     points = surfaces.corners_world.reshape(-1, 3)
     faces = np.arange(len(points), dtype=np.int32).reshape(-1, 3)
-    is_cutout = ((materials.opacity_textures >= 0) | (materials.opacities < 1.0))[surfaces.material_ids]
+    has_holes = (materials.opacity_textures >= 0) | (materials.opacities < 1.0)
+    is_cutout = (has_holes | (materials.uses_vertex_alpha != 0))[surfaces.material_ids]
     is_filter = is_cutout | (materials.kinds[surfaces.material_ids] == GLASS)
     some = bool(is_filter.any())
     return CompiledMeshes(
@@ -182,6 +183,7 @@ class _MeshBuilder:
     uv: list[Float32[np.ndarray, "f 3 2"]] = field(default_factory=list)
     rows: list[Int32[np.ndarray, " f"]] = field(default_factory=list)
     rgb_linear: list[Float32[np.ndarray, "f 3 3"] | None] = field(default_factory=list)
+    alpha: list[Float32[np.ndarray, "f 3"] | None] = field(default_factory=list)
     emissive: list[EmissiveMesh] = field(default_factory=list)
 
     def add(
@@ -191,6 +193,7 @@ class _MeshBuilder:
         rows: Int32[np.ndarray, " f"],
         uv: Float32[np.ndarray, "f 3 2"] | None = None,
         rgb_linear: Float32[np.ndarray, "f 3 3"] | None = None,
+        alpha: Float32[np.ndarray, "f 3"] | None = None,
     ) -> None:
         self.corners.append(corners)
         self.normals.append(normals)
@@ -198,6 +201,7 @@ class _MeshBuilder:
         # the kernels need numbers: NaN marks corners without coordinates
         self.uv.append(np.zeros((len(corners), 3, 2), np.float32) if uv is None else np.nan_to_num(uv))
         self.rgb_linear.append(rgb_linear)
+        self.alpha.append(alpha)
 
     def surfaces(self) -> SurfaceArrays:
         colored = any(rgb is not None for rgb in self.rgb_linear)
@@ -206,6 +210,12 @@ class _MeshBuilder:
             for corners, rgb in zip(self.corners, self.rgb_linear, strict=True)
             if colored
         ]
+        is_clear = any(alpha is not None for alpha in self.alpha)
+        alphas = [
+            np.ones(corners.shape[:2], np.float32) if alpha is None else alpha
+            for corners, alpha in zip(self.corners, self.alpha, strict=True)
+            if is_clear
+        ]
         nothing = np.zeros((0, 3, 3), np.float32)
         return SurfaceArrays(
             np.concatenate([nothing, *self.corners]),
@@ -213,6 +223,7 @@ class _MeshBuilder:
             np.concatenate([np.zeros((0, 3, 2), np.float32), *self.uv]),
             np.concatenate([np.zeros(0, np.int32), *self.rows]),
             np.concatenate([nothing, *colors]),
+            np.concatenate([np.zeros((0, 3), np.float32), *alphas]),
         )
 
 
@@ -240,12 +251,20 @@ def _add_mesh(
         known = np.isfinite(stated).all(axis=(1, 2))
         normals[known] = stated[known]
     rows = np.empty(len(corners), np.int32)
+    alpha = np.ones((len(corners), 3), np.float32)
     for chosen, given in materials:
         has_uv = shape.corner_uv is not None and bool(np.isfinite(shape.corner_uv[chosen]).all())
         # a stage's own material replaces the file's colors as well
         tinted = mesh.material is None and shape.corner_rgb_linear is not None
+        if given.uses_vertex_alpha and shape.corner_alpha is not None:
+            alpha[chosen] = np.clip(np.nan_to_num(shape.corner_alpha[chosen], nan=1.0), 0.0, 1.0)
         row = builder.table.add(
-            given.material, f"{name}.material", has_uv=has_uv, uses_vertex_color=tinted, images=given.images
+            given.material,
+            f"{name}.material",
+            has_uv=has_uv,
+            uses_vertex_color=tinted,
+            uses_vertex_alpha=given.uses_vertex_alpha,
+            images=given.images,
         )
         rows[chosen] = row
         if isinstance(given.material, Emissive) and given.material.emission > 0.0:
@@ -258,8 +277,9 @@ def _add_mesh(
             uv = np.zeros((len(own), 3, 2), np.float32)
             if shape.corner_uv is not None:
                 uv = np.nan_to_num(shape.corner_uv[own])
-            builder.emissive.append(EmissiveMesh(corners[own], uv, radiance, texture, opacity))
-    builder.add(corners, normals, rows, shape.corner_uv, shape.corner_rgb_linear)
+            builder.emissive.append(EmissiveMesh(corners[own], uv, alpha[own], radiance, texture, opacity))
+    is_clear = any(given.uses_vertex_alpha for _, given in materials)
+    builder.add(corners, normals, rows, shape.corner_uv, shape.corner_rgb_linear, alpha if is_clear else None)
 
 
 def _face_materials(

@@ -22,10 +22,12 @@ class ImportedMaterial:
     Attributes:
         material: with names of images that only ``images`` knows.
         images: of the file.
+        uses_vertex_alpha: whether the alpha of the mesh's corners is multiplied by the opacity.
     """
 
     material: Material
     images: Mapping[str, FileImage]
+    uses_vertex_alpha: bool = False
 
 
 def import_material(
@@ -55,7 +57,7 @@ def import_material(
     if source.transmission >= 0.5:
         named = {"texture": source.texture, "normal texture": source.normal_texture}
         left_out += [f"{key} on glass" for key, image in named.items() if image is not None]
-        if source.opacity < 1.0 or source.opacity_texture is not None:
+        if source.opacity < 1.0 or source.opacity_texture is not None or source.uses_vertex_alpha:
             left_out.append("opacity of glass")
         if source.clear_coat > 0.0:
             left_out.append("a clear coat on glass")
@@ -81,11 +83,15 @@ def import_material(
             "metallic_roughness_texture": source.metallic_roughness_texture,
             "normal_texture": source.normal_texture,
             "emission_texture": source.emission_texture,
+            "clear_coat_texture": source.clear_coat_texture,
+            "clear_coat_roughness_texture": source.clear_coat_roughness_texture,
         }
         strength = max(source.emission_linear)
         # an image alone sends no light: it is a factor
         if strength == 0.0:
             fields["emission_texture"] = None
+        if source.clear_coat == 0.0:
+            fields["clear_coat_texture"] = fields["clear_coat_roughness_texture"] = None
         images = {name: image for name, image in fields.items() if image is not None}
         names = {name: name for name in images}
         opacity_texture = None
@@ -112,7 +118,8 @@ def import_material(
         )
     if left_out:
         warn(f"of the material {source.name or 'without a name'} is not used: {', '.join(left_out)}.")
-    return ImportedMaterial(material, images)
+    is_glass = isinstance(material, Glass)
+    return ImportedMaterial(material, images, source.uses_vertex_alpha and not is_glass)
 
 
 def _clamp_unit(value: float) -> float:

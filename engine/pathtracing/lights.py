@@ -40,11 +40,13 @@ class Opacity(NamedTuple):
         factor: share of it, times that of the texture.
         texture: number of a texture, -1 for none.
         cutoff: the surface is there where the opacity reaches this; -1 for none.
+        uses_vertex_alpha: whether the alpha of its corners is multiplied by it.
     """
 
     factor: float = 1.0
     texture: int = -1
     cutoff: float = -1.0
+    uses_vertex_alpha: int = 0
 
 
 WHOLE = Opacity()
@@ -57,6 +59,7 @@ class EmissiveMesh:
     Attributes:
         corners_world: of each.
         corner_uv: texture coordinates.
+        corner_alpha: factor of the opacity.
         rgb_linear: radiance.
         texture: number of a texture that is multiplied by it, -1 for none.
         opacity: of the surface; what is not there does not shine.
@@ -64,6 +67,7 @@ class EmissiveMesh:
 
     corners_world: Float32[np.ndarray, "f 3 3"]
     corner_uv: Float32[np.ndarray, "f 3 2"]
+    corner_alpha: Float32[np.ndarray, "f 3"]
     rgb_linear: Float64[np.ndarray, "3"]
     texture: int = -1
     opacity: Opacity = WHOLE
@@ -79,11 +83,13 @@ class _MeshTables(NamedTuple):
     cdf: Float64[np.ndarray, " c"]
     corners_world: Float32[np.ndarray, "f 3 3"]
     uv: Float32[np.ndarray, "f 3 2"]
+    alpha: Float32[np.ndarray, "f 3"]
 
 
 def _mesh_tables(meshes: Sequence[EmissiveMesh]) -> _MeshTables:
     rows, sums = np.zeros((len(meshes), 3), np.int64), [np.zeros(0)]
     corners, uv = [np.zeros((0, 3, 3), np.float32)], [np.zeros((0, 3, 2), np.float32)]
+    alpha = [np.zeros((0, 3), np.float32)]
     face, row = 0, 0
     for m, mesh in enumerate(meshes):
         own = triangle_areas(mesh.corners_world)
@@ -91,9 +97,10 @@ def _mesh_tables(meshes: Sequence[EmissiveMesh]) -> _MeshTables:
         sums.append(np.concatenate([[0.0], np.cumsum(own) / own.sum()]))
         corners.append(mesh.corners_world)
         uv.append(mesh.corner_uv)
+        alpha.append(mesh.corner_alpha)
         # a mesh's sums have one row more than it has triangles
         face, row = face + len(own), row + len(own) + 1
-    return _MeshTables(rows, np.concatenate(sums), np.concatenate(corners), np.concatenate(uv))
+    return _MeshTables(rows, *(np.concatenate(parts) for parts in (sums, corners, uv, alpha)))
 
 
 def build_light_arrays(
@@ -122,6 +129,7 @@ def build_light_arrays(
     areas, cosines = np.zeros(count), np.tile([0.0, 1.0], (count, 1))
     textures, rows = np.full(count, -1, np.int32), np.zeros((count, 3), np.int64)
     opacities, opacity_cutoffs, opacity_textures = np.ones(count), np.full(count, -1.0), textures.copy()
+    uses_vertex_alpha = np.zeros(count, np.int32)
     for l, light in enumerate(lights):
         color = srgb_to_linear(np.array(light.color_srgb))
         adds[l], casts_shadows[l] = light.adds_light, light.casts_shadows
@@ -152,7 +160,7 @@ def build_light_arrays(
         # mean of the surface, for estimates of its distance
         positions[l] = own @ mesh.corners_world.mean(axis=1, dtype=np.float64) / own.sum()
         textures[l], rows[l] = mesh.texture, tables.rows[l - len(lights)]
-        opacities[l], opacity_textures[l], opacity_cutoffs[l] = mesh.opacity
+        opacities[l], opacity_textures[l], opacity_cutoffs[l], uses_vertex_alpha[l] = mesh.opacity
     # light from where nothing keeps it off is not found by paths that things keep off
     visibility *= casts_shadows
     takes = casts_shadows * (1 - adds)
@@ -181,10 +189,12 @@ def build_light_arrays(
         opacities=opacities,
         opacity_textures=opacity_textures,
         opacity_cutoffs=opacity_cutoffs,
+        uses_vertex_alpha=uses_vertex_alpha,
         mesh_rows=rows,
         mesh_cdf=tables.cdf,
         mesh_corners_world=tables.corners_world,
         mesh_uv=tables.uv,
+        mesh_alpha=tables.alpha,
         texels_linear=np.zeros((0, 3), np.float32) if texels_linear is None else texels_linear,
         texture_sizes=np.zeros((0, 3), np.int64) if texture_sizes is None else texture_sizes,
         environment_linear=radiance,

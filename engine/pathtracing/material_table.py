@@ -48,9 +48,12 @@ _DEFAULTS: dict[str, np.ndarray] = {
     "coat_tables": np.array(0, np.int32),
     "clear_coats": np.array(0.0),
     "clear_coat_roughness": np.array(0.0),
+    "clear_coat_textures": np.array(-1, np.int32),
+    "clear_coat_roughness_textures": np.array(-1, np.int32),
     "opacities": np.array(1.0),
     "opacity_textures": np.array(-1, np.int32),
     "opacity_cutoffs": np.array(-1.0),
+    "uses_vertex_alpha": np.array(0, np.int32),
     "color_textures": np.array(-1, np.int32),
     "metallic_roughness_textures": np.array(-1, np.int32),
     "normal_textures": np.array(-1, np.int32),
@@ -60,7 +63,7 @@ _DEFAULTS: dict[str, np.ndarray] = {
 }
 """What a material is where it says nothing else."""
 
-OPACITY_COLUMNS = ("opacities", "opacity_textures", "opacity_cutoffs")
+OPACITY_COLUMNS = ("opacities", "opacity_textures", "opacity_cutoffs", "uses_vertex_alpha")
 
 
 class MaterialTable:
@@ -85,6 +88,7 @@ class MaterialTable:
         *,
         has_uv: bool,
         uses_vertex_color: bool,
+        uses_vertex_alpha: bool,
         images: Mapping[str, FileImage],
     ) -> int:
         """Add a material and return its row.
@@ -94,6 +98,7 @@ class MaterialTable:
             label: what errors call it.
             has_uv: whether the mesh has texture coordinates.
             uses_vertex_color: whether the colors of the mesh's corners count.
+            uses_vertex_alpha: whether the alpha of these colors does.
             images: of a mesh file, by the names that the material has for them.
 
         Raises:
@@ -135,9 +140,11 @@ class MaterialTable:
             row |= {"iors": material.ior, "coat_tables": self._albedo_table_id("coat", material.ior)}
         if isinstance(material, Diffuse | Dielectric | MetallicRoughness):
             row["color_textures"] = texture(material.texture, "color")
-            row |= _opacity_columns(material, texture)
+            row |= _opacity_columns(material, uses_vertex_alpha, texture)
         if isinstance(material, ClearCoated):
             row |= {"clear_coats": material.clear_coat, "clear_coat_roughness": material.clear_coat_roughness}
+            row["clear_coat_textures"] = texture(material.clear_coat_texture, "data")
+            row["clear_coat_roughness_textures"] = texture(material.clear_coat_roughness_texture, "data")
         if isinstance(material, NormalMapped):
             row["normal_textures"] = texture(material.normal_texture, "data")
             row["normal_scales"] = material.normal_scale
@@ -219,16 +226,19 @@ class MaterialTable:
 
 
 def _opacity_columns(
-    material: Diffuse | Dielectric | MetallicRoughness, texture: Callable[[str | None, TextureUse], int]
+    material: Diffuse | Dielectric | MetallicRoughness,
+    uses_vertex_alpha: bool,
+    texture: Callable[[str | None, TextureUse], int],
 ) -> dict[str, object]:
     """Return the columns of what is there of a surface; ``texture`` gives the number of an image."""
     is_own = material.opacity_texture == material.texture
     image = texture(material.opacity_texture, "alpha" if is_own else "alpha or grey")
     opacity, cutoff = material.opacity, material.opacity_cutoff
     # one number and a cutoff: all of it or nothing
-    if image < 0 and cutoff is not None:
+    if image < 0 and not uses_vertex_alpha and cutoff is not None:
         opacity, cutoff = float(opacity >= cutoff), None
-    return dict(zip(OPACITY_COLUMNS, (opacity, image, -1.0 if cutoff is None else cutoff), strict=True))
+    values = (opacity, image, -1.0 if cutoff is None else cutoff, int(uses_vertex_alpha))
+    return dict(zip(OPACITY_COLUMNS, values, strict=True))
 
 
 def _channels_of_use(values: Float32[np.ndarray, "h w c"], use: TextureUse) -> Float32[np.ndarray, "h w 3"]:

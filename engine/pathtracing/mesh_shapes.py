@@ -30,6 +30,7 @@ class MeshShape:
             none; None without any.
         normals: of the vertices, NaN where they are not known; None without any.
         corner_rgb_linear: colors of the faces' corners; None without any.
+        corner_alpha: alpha of these colors, NaN where there is none; None without any.
         material_numbers: row of each face in ``materials``, -1 for none; None without any.
         materials: of the file.
     """
@@ -39,6 +40,7 @@ class MeshShape:
     corner_uv: Float32[np.ndarray, "f 3 2"] | None = None
     normals: Float64[np.ndarray, "v 3"] | None = None
     corner_rgb_linear: Float32[np.ndarray, "f 3 3"] | None = None
+    corner_alpha: Float32[np.ndarray, "f 3"] | None = None
     material_numbers: Int32[np.ndarray, " f"] | None = None
     materials: tuple[MeshMaterial, ...] = ()
 
@@ -64,6 +66,7 @@ def read_shape(path: Path) -> MeshShape:
         corner_uv=mesh.corner_uv,
         normals=None if mesh.normals is None else mesh.normals.astype(np.float64),
         corner_rgb_linear=None if mesh.rgb_linear is None else mesh.rgb_linear[mesh.triangles],
+        corner_alpha=None if mesh.alpha is None else mesh.alpha[mesh.triangles],
         material_numbers=mesh.material_indices,
         materials=mesh.materials,
     )
@@ -203,6 +206,7 @@ def turn_outwards(shape: MeshShape, face_mask: Bool[np.ndarray, " f"]) -> MeshSh
         corner_uv=turned(shape.corner_uv),
         normals=normals,
         corner_rgb_linear=turned(shape.corner_rgb_linear),
+        corner_alpha=turned(shape.corner_alpha),
     )
 
 

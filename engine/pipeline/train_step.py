@@ -181,17 +181,23 @@ def _warn_of_useless_materials(run: ReconstructionRun) -> None:
     run.progress(Noted("Two short trainings show first whether materials explain these photographs."))
     gain_db = material_gain_db(
         run.dataset,
+        recipe=config.materials.recipe,
         background=config.background,
         seed=config.seed,
         threads=run.threads,
         should_stop=run.should_stop,
     )
     if gain_db < -MAX_MATERIAL_LOSS_DB:
+        advice = (
+            ""
+            if config.materials.recipe == "near_field"
+            else " For something shiny in a room there is --set materials.recipe=near_field."
+        )
         run.progress(
             Warned(
                 f"In a short training new views are {-gain_db:.1f} dB worse with materials than without: "
                 "little here reflects its surroundings clearly, or they are near. Leave out --materials "
-                "unless the scene is to be lit anew."
+                f"unless the scene is to be lit anew.{advice}"
             )
         )
 

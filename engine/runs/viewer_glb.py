@@ -12,6 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.dataset import load_dataset_model
+from octasplat.engine.files import read_metadata
 from octasplat.engine.files.export_options import ExportCamera, ExportOptions
 from octasplat.engine.files.mesh_glb import CORES_IN_ORDER, CORES_OF_CHUNKS
 from octasplat.engine.gaussians.frames import quaternions_from_matrices
@@ -83,16 +85,27 @@ def prepare_for_viewers(
     return gaussians.select(order), options.model_copy(update={"chunks": 1, "cores": CORES_IN_ORDER})
 
 
-def upright_turn(source: Path) -> tuple[float, float, float, float] | None:
-    """Return the rotation (x, y, z, w) by which a run's scene stands upright in glTF; None for a file.
+def upright_turn(source: Path, dataset: Path | None = None) -> tuple[float, float, float, float] | None:
+    """Return the rotation (x, y, z, w) by which a scene stands upright in glTF, y up.
+
+    Args:
+        source: the folder of a run, or a file of Gaussians.
+        dataset: a folder of photographs whose cameras to take; None takes those that a run keeps.
+
+    Returns:
+        None where no cameras are known, as of a file alone.
 
     Raises:
-        DatasetError: the cameras of the run are not known any more.
+        DatasetError: the cameras of the run are not known any more, or the photographs cannot be used.
     """
-    if not _has_cameras(source):
+    if _has_cameras(source):
+        seen = run_viewpoints(source, scene=dataset)
+        cameras = photograph_cameras(seen, seen.train_indices, CAMERA_SIDE_PX)
+    elif dataset is not None:
+        photographs = load_dataset_model(dataset, origin_world=read_metadata(source).origin_world)
+        cameras = photograph_cameras(photographs, np.arange(len(photographs.views)), CAMERA_SIDE_PX)
+    else:
         return None
-    seen = run_viewpoints(source)
-    cameras = photograph_cameras(seen, seen.train_indices, CAMERA_SIDE_PX)
     return _upright_turn(cameras, _focus(cameras)[0])
 
 

@@ -69,12 +69,14 @@ class DeferredShading:
     Attributes:
         harmonics_are_shaded: whether the harmonics learn the shaded colors, so that they can be computed
             from materials and light.
+        albedo_holds_light: whether the base color of what is matt is the color that photographs show.
         light: the environment.
         frame: its right, up and forward in the world, as rows.
     """
 
     name = "materials"
     harmonics_are_shaded: ClassVar[bool] = True
+    albedo_holds_light: ClassVar[bool] = False
 
     def __init__(self, settings: MaterialSettings, *, extent_world: float, one_sided: bool = False) -> None:
         self.settings = settings
@@ -223,9 +225,10 @@ class DeferredShading:
             display=display,
             incident=incident,
             ramp=ramp,
+            share=self._shaded_share(traced, gbuffer, ramp),
         )
         rgb = self._unshaded_part(traced, context)
-        rgb[gbuffer.ray_ids] += (ramp * gbuffer.alpha[:, None] * display).astype(np.float32)
+        rgb[gbuffer.ray_ids] += ((context.share * gbuffer.alpha)[:, None] * display).astype(np.float32)
         # only finished pictures have layers
         layers = {} if traced.view is not None else context.named_layers(self._layer_radiance(context, rgb))
         return ShadedRays(split.sum_layers(rgb), result.transmittance, context, layers)
@@ -247,8 +250,8 @@ class DeferredShading:
         grad_alpha, grad_normal = split.expand(grad_alpha), split.expand(grad_normal)
         grad_features, grad_depth = split.expand(grad_features), split.expand(grad_depth)
         # --- the split sum at the shaded points ---
-        grad_display = split.expand(grad_rgb)[gbuffer.ray_ids] * ctx.ramp
-        grad_alpha[gbuffer.ray_ids] += (grad_display * ctx.display).sum(axis=1)  # rgb = ramp alpha display
+        grad_display = split.expand(grad_rgb)[gbuffer.ray_ids] * ctx.share[:, None].astype(np.float32)
+        grad_alpha[gbuffer.ray_ids] += (grad_display * ctx.display).sum(axis=1)  # rgb = share alpha display
         grad_linear = self._display_backward(ctx.linear, grad_display * gbuffer.alpha[:, None])
         blur = settings.blur_roughness(traced.training_progress)
         back = shade_backward(ctx.surface, self.light.levels, self.frame, grad_linear, blur=blur)
@@ -296,6 +299,10 @@ class DeferredShading:
         self.light.restore(own)
 
     # --- the steps in which recipes differ ---
+
+    def _shaded_share(self, traced: TracedRays, gbuffer: GBuffer, ramp: float) -> Float64[np.ndarray, " p"]:
+        """Return the share of each point that is shaded, not taken from the harmonics."""
+        return np.full(len(gbuffer.ray_ids), ramp)
 
     def _split_into_layers(self, traced: TracedRays) -> DepthLayers:
         """Return the depth layers of the rays, each to be shaded separately."""

@@ -1,6 +1,6 @@
 """The G-buffer: materials, normals and depths blended along rays before shading, with its backward pass."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import numpy as np
@@ -46,6 +46,17 @@ class GBuffer:
     depth: Float64[np.ndarray, " p"]
     facing_normals: FacedNormals
     surface: SurfacePoints
+
+    def select(self, point_ids: Int64[np.ndarray, " w"]) -> "GBuffer":
+        """Return the buffer of some of the points."""
+        surface = {entry.name: getattr(self.surface, entry.name)[point_ids] for entry in fields(self.surface)}
+        return GBuffer(
+            self.ray_ids[point_ids],
+            self.alpha[point_ids],
+            self.depth[point_ids],
+            FacedNormals(*(values[point_ids] for values in self.facing_normals)),
+            SurfacePoints(**surface),
+        )
 
 
 def build_gbuffer(rays: RayBatch, result: TraceResult) -> GBuffer:

@@ -23,7 +23,7 @@ from octasplat.engine.shading.reflection_rays import (
     probe_roughness,
     trace_ray_pairs,
 )
-from octasplat.engine.shading.reflection_tracing import IncidentLight, ReflectionTracer, backward_reflections
+from octasplat.engine.shading.reflection_tracing import IncidentLight, IncidentTracer
 from octasplat.engine.trace.protocol import Recording, TraceGradients
 
 PROGRESS_SALTS = 1 << 20
@@ -56,7 +56,7 @@ class IncidentLightModel(Protocol):
 
 @dataclass(frozen=True)
 class RayPairIncidentLight:
-    """Pairs of rays, what they meet shaded by the split sum.
+    """Pairs of rays, and what they meet as the tracer of reflected rays shades it.
 
     See :mod:`octasplat.engine.shading.reflection_rays`.
 
@@ -64,14 +64,12 @@ class RayPairIncidentLight:
         pairs: what they saw.
         probe: what changes with the roughness at some of the points; None unless in a training.
         roughness: of all points.
-        reflection_tracer: that followed the rays.
         settings: of the materials.
     """
 
     pairs: ReflectionRayPairs
     probe: RoughnessProbe | None
     roughness: Float64[np.ndarray, " p"]
-    reflection_tracer: ReflectionTracer
     settings: MaterialSettings
 
     @classmethod
@@ -80,7 +78,7 @@ class RayPairIncidentLight:
         traced: TracedRays,
         split: DepthLayers,
         gbuffer: GBuffer,
-        reflection_tracer: ReflectionTracer,
+        reflection_tracer: IncidentTracer,
         settings: MaterialSettings,
     ) -> "RayPairIncidentLight":
         """Trace pairs of rays for the points of a G-buffer."""
@@ -102,7 +100,7 @@ class RayPairIncidentLight:
             # salt + 1: independent of the facets' numbers
             is_probed = direction_uniforms(directions, salt + 1)[0] < settings.roughness_probe_fraction
             probe = probe_roughness(rays, gbuffer, reflection_tracer, pairs, is_probed, min_slope=min_slope)
-        return cls(pairs, probe, gbuffer.surface.material[:, 4], reflection_tracer, settings)
+        return cls(pairs, probe, gbuffer.surface.material[:, 4], settings)
 
     @property
     def incident(self) -> IncidentLight:
@@ -125,13 +123,7 @@ class RayPairIncidentLight:
     def backward(self, back: ShadeGradients, grad_texels: Float64[np.ndarray, "t 3"]) -> RecordedGradients:
         """Return gradients by all that was hit on the way."""
         grad_seen = backward_mean(IncidentLight(back.visibility, back.indirect))
-        return backward_reflections(
-            self.pairs.reflected,
-            self.reflection_tracer.light,
-            self.reflection_tracer.frame,
-            grad_seen,
-            grad_texels,
-        )
+        return self.pairs.reflected.backward(grad_seen, grad_texels)
 
 
 @dataclass(frozen=True)

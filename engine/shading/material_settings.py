@@ -20,7 +20,7 @@ PROPAGATION_UNTIL = 0.4
 """Share of the training at which that ends."""
 INITIAL_ALBEDO, INITIAL_METALLIC, INITIAL_ROUGHNESS = 0.5, 0.5, 0.3
 """Materials that all Gaussians begin with: in the middle, and smooth enough to show what they reflect."""
-Recipe = Literal["split_sum", "ref_gaussian"]
+Recipe = Literal["split_sum", "ref_gaussian", "near_field"]
 
 
 class MaterialSettings(Settings):
@@ -39,7 +39,8 @@ class MaterialSettings(Settings):
         'Gaussian Splatting" (https://arxiv.org/abs/2412.19282) does: the matt part is a color of its '
         "own from the harmonics, the environment stays in [0, 1], everything is in display "
         "values, visibility is yes or no, and materials start over when deferred shading "
-        "begins.",
+        "begins. near_field is for rooms: only what reflects is shaded, and mirrors the harmonics of what "
+        "stands around it.",
     )
     up_world: Annotated[tuple[float, float, float], Unit("world direction"), ADVANCED] = Field(
         (0.0, 0.0, 1.0),

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float64, Int64
 from octasplat.engine.core.hashing import hashed_uniforms
 from octasplat.engine.core.rays import RayBatch, concatenate_rays
 from octasplat.engine.shading.gbuffer import GBuffer, reflected_rays
-from octasplat.engine.shading.reflection_tracing import IncidentLight, ReflectedRays, ReflectionTracer
+from octasplat.engine.shading.reflection_tracing import IncidentLight, IncidentTracer, TracedReflections
 from octasplat.engine.shading.split_sum import SurfacePoints
 
 MAX_FACET_SLOPE = 0.9
@@ -78,7 +78,7 @@ class ReflectionRayPairs:
     """
 
     facets: FacetPair
-    reflected: ReflectedRays
+    reflected: TracedReflections
 
     @property
     def incident(self) -> IncidentLight:
@@ -101,7 +101,7 @@ class RoughnessProbe(NamedTuple):
 def trace_ray_pairs(
     rays: RayBatch,
     gbuffer: GBuffer,
-    reflection_tracer: ReflectionTracer,
+    reflection_tracer: IncidentTracer,
     numbers: Float64[np.ndarray, "2 p"],
     *,
     min_slope: float,
@@ -130,7 +130,7 @@ def trace_ray_pairs(
 def probe_roughness(
     rays: RayBatch,
     gbuffer: GBuffer,
-    reflection_tracer: ReflectionTracer,
+    reflection_tracer: IncidentTracer,
     pairs: ReflectionRayPairs,
     is_probed: Bool[np.ndarray, " p"],
     *,

@@ -6,7 +6,7 @@ are mirrored at the normals.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float64
@@ -37,6 +37,36 @@ class IncidentLight(NamedTuple):
     light_linear: Float64[np.ndarray, "s 3"]
 
 
+@runtime_checkable
+class TracedReflections(Protocol):
+    """Reflected rays that were traced."""
+
+    @property
+    def incident(self) -> IncidentLight:
+        """Return what each ray saw."""
+        ...
+
+    def backward(
+        self, grad_incident: IncidentLight, grad_texels: Float64[np.ndarray, "t 3"]
+    ) -> tuple[tuple[Recording, TraceGradients], ...]:
+        """Return gradients by what was met; those by the environment are added to ``grad_texels``."""
+        ...
+
+
+@runtime_checkable
+class IncidentTracer(Protocol):
+    """Tracer of reflected rays."""
+
+    @property
+    def offset(self) -> RayOffset:
+        """Return how rays leave a surface."""
+        ...
+
+    def trace(self, rays: RayBatch, *, record: bool) -> TracedReflections:
+        """Trace reflected rays; ``record`` keeps what the backward pass needs."""
+        ...
+
+
 @dataclass(frozen=True)
 class ReflectedRays:
     """Reflected rays and what they hit.
@@ -48,6 +78,7 @@ class ReflectedRays:
         surface: the points of that, with what further rays say of them.
         linear: their radiance.
         next_bounce: the rays from there on.
+        tracer: that followed them.
     """
 
     trace: TraceResult
@@ -56,6 +87,7 @@ class ReflectedRays:
     surface: SurfacePoints
     linear: Float64[np.ndarray, "q 3"]
     next_bounce: "ReflectedRays | None"
+    tracer: "ReflectionTracer"
 
     @property
     def incident(self) -> IncidentLight:
@@ -63,6 +95,12 @@ class ReflectedRays:
         light = np.zeros((len(self.depth_layers.rays), 3))
         light[self.gbuffer.ray_ids] = self.gbuffer.alpha[:, None] * self.linear
         return IncidentLight(self.trace.transmittance.astype(np.float64), self.depth_layers.sum_layers(light))
+
+    def backward(
+        self, grad_incident: IncidentLight, grad_texels: Float64[np.ndarray, "t 3"]
+    ) -> tuple[tuple[Recording, TraceGradients], ...]:
+        """Return :func:`backward_reflections`."""
+        return backward_reflections(self, self.tracer.light, self.tracer.frame, grad_incident, grad_texels)
 
 
 @dataclass(frozen=True)
@@ -115,6 +153,7 @@ class ReflectionTracer:
             surface=surface,
             linear=shade(surface, self.light, self.frame),
             next_bounce=next_bounce,
+            tracer=self,
         )
 
 

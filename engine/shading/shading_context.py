@@ -22,7 +22,8 @@ class ShadingContext:
         linear: their radiance.
         display: their colors as shown.
         incident: light along reflected directions; None where none was traced.
-        ramp: share of the picture that is shaded, not taken from the harmonics.
+        ramp: share of the picture that is shaded, not taken from the harmonics, as far as training has come.
+        share: the same at each point.
     """
 
     depth_layers: DepthLayers
@@ -32,17 +33,18 @@ class ShadingContext:
     display: Float64[np.ndarray, "p 3"]
     incident: IncidentLightModel | None
     ramp: float
+    share: Float64[np.ndarray, " p"]
 
     def named_layers(
         self, radiance_linear: Float64[np.ndarray, "p 3"]
     ) -> dict[str, Float32[np.ndarray, "r _"]]:
         """Return radiance, materials, visibility and indirect light by name, means over each ray's layers."""
-        surface = self.surface
+        surface, material = self.surface, self.gbuffer.surface.material
         values = {
             "linear": radiance_linear,
-            "albedo": surface.material[:, :3],
-            "metallic": surface.material[:, 3:4],
-            "roughness": surface.material[:, 4:5],
+            "albedo": material[:, :3],
+            "metallic": material[:, 3:4],
+            "roughness": material[:, 4:5],
             "visibility": surface.visibility[:, None],
             "indirect": surface.indirect_linear,
         }

@@ -95,6 +95,23 @@ def test_render_of_materials_run_is_shaded_as_its_evaluation(materials_run, octa
     assert (tmp_path / "plain" / rendered[0].name).read_bytes() != rendered[0].read_bytes()
 
 
+def test_near_field_run_is_rendered_as_evaluated_and_relit_with_a_warning(scene, octasplat, tiny, tmp_path):
+    near = ("--set", "materials.recipe=near_field")
+    result = octasplat("reconstruct", scene, "-o", tmp_path / "run", *tiny, *MATERIALS, *near)
+    assert result.exit_code == 0, result.output
+    gaussians, _ = read_gaussian_ply(tmp_path / "run" / "scene.ply")
+    assert has_materials(gaussians) and "bounced" not in gaussians.channels
+    assert octasplat("render", tmp_path / "run", "-o", tmp_path / "views").exit_code == 0
+    evaluated = sorted((tmp_path / "run" / "renders").glob("*.png"))
+    assert evaluated
+    for path in evaluated:
+        np.testing.assert_array_equal(read_image(tmp_path / "views" / path.name), read_image(path))
+    light = ("--environment", tmp_path / "run" / "environment.hdr")
+    result = octasplat("relight", tmp_path / "run", *light, "-o", tmp_path / "relit")
+    assert result.exit_code == 0, result.output
+    assert "hold the light of the photographs" in " ".join(result.output.split())
+
+
 def test_exr_of_materials_run_keeps_radiance_above_white(materials_run, octasplat, tmp_path):
     """A PNG of the same picture is clipped."""
     bright = tmp_path / "bright"

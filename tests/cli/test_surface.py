@@ -8,6 +8,11 @@ import numpy as np
 import pytest
 import trimesh
 
+from octasplat.engine.dataset.views_file import read_views
+from octasplat.engine.files.glb_container import GlbFile
+from octasplat.engine.files.glb_place import rotation_of
+from octasplat.engine.render.upright import estimate_up
+
 SMALL = ("--resolution", 48, "--depth-side", 48, "--min-component", 0)
 
 
@@ -48,6 +53,49 @@ def test_surface_levels_of_detail_match_single_runs(run, octasplat, tmp_path):
     assert result.output.count("Rendered") == 1 and result.output.count("Wrote") == 2
     octasplat("surface", run.output, "-o", tmp_path / "b.glb", *options, "--max-triangles", 100)
     assert (tmp_path / "b.glb").read_bytes() == (tmp_path / "a_100.glb").read_bytes()
+
+
+def usdz_rotation(path):
+    """The rotation of the root of a USDZ, columns."""
+    usd = pytest.importorskip("pxr.Usd", reason="usd-core is not installed")
+    from pxr import UsdGeom
+
+    stage = usd.Stage.Open(str(path))
+    root = UsdGeom.XformCache().GetLocalToWorldTransform(stage.GetDefaultPrim())
+    return np.array(root)[:3, :3].T
+
+
+def glb_rotation(path):
+    """The rotation of the root node of a GLB, as its document says it."""
+    return rotation_of(GlbFile(path).document["nodes"][0]["rotation"])
+
+
+def test_surface_stands_upright_as_export_does(run, octasplat, tmp_path):
+    # z is up in this world
+    rotations = np.stack(
+        [view.rotation_cam_from_world for view in read_views(run.output / "views.json").views]
+    )
+    up = estimate_up(rotations)
+    assert up[2] > 0.9
+    for name in ("a.glb", "a.usdz"):
+        result = octasplat("surface", run.output, "-o", tmp_path / name, *SMALL)
+        assert result.exit_code == 0, result.output
+    result = octasplat("export", run.output, tmp_path / "surface.usdz", tmp_path / "surface.glb")
+    assert result.exit_code == 0, result.output
+    turns = [glb_rotation(tmp_path / name) for name in ("surface.glb", "a.glb")]
+    turns += [usdz_rotation(tmp_path / name) for name in ("surface.usdz", "a.usdz")]
+    for turn in turns:
+        np.testing.assert_allclose(turn, turns[0], atol=1e-6)
+        np.testing.assert_allclose(turn @ up, [0, 1, 0], atol=0.02)
+
+
+def test_surface_of_file_stands_as_cameras_of_dataset_tell(run, octasplat, tmp_path):
+    for name, given in (("a.glb", ()), ("b.glb", ("--dataset", run.scene))):
+        result = octasplat("surface", run.output / "scene.ply", *given, "-o", tmp_path / name, *SMALL)
+        assert result.exit_code == 0, result.output
+    # without cameras by half about x, as COLMAP's y points down
+    np.testing.assert_allclose(glb_rotation(tmp_path / "a.glb"), np.diag([1, -1, -1]), atol=1e-9)
+    np.testing.assert_allclose(glb_rotation(tmp_path / "b.glb") @ [0, 0, 1], [0, 1, 0], atol=0.05)
 
 
 def test_surface_unbounded_quiet_prints_nothing(run, octasplat, tmp_path):

@@ -175,6 +175,89 @@ def test_glb_blend_and_obj_opacity_cover_by_their_alpha(tmp_path: Path) -> None:
         np.testing.assert_allclose(found.mean(), (alpha * covered + (1 - alpha) * free).mean(), rtol=5e-3)
 
 
+BLACK_BLEND = {
+    "pbrMetallicRoughness": {"baseColorFactor": [0, 0, 0, 1], "metallicFactor": 0},
+    "alphaMode": "BLEND",
+    # nothing is reflected
+    "extensions": {"KHR_materials_ior": {"ior": 1.0}},
+}
+
+
+ACROSS = -(np.arange(40) - 19.5) / 2 * 4 * np.tan(np.radians(2))
+"""x of the pixels of 40 x 4 that see 4 degrees from 4 units above."""
+
+
+def over_white(folder: Path, name: str, samples: int = 1024) -> np.ndarray:
+    """What a mesh of black shows before white, in darkness: a row along ``ACROSS``, seen from above."""
+    stage = Stage(
+        up=Y_UP, gaussians=(), meshes=(StageMesh(file=name),),
+        integrator=Integrator(samples=samples, max_depth=2, anti_aliasing=False),
+    )  # fmt: skip
+    view = camera((0.0, 4, 1e-3), (0, 0, 0), (40, 4), 4)
+    return film_of(stage, view, folder, background=1.0).image().rgb_linear[..., 0].mean(axis=0)
+
+
+def rgba_of(alpha: Any) -> np.ndarray:
+    """Colors of the plane's four corners."""
+    return np.concatenate([np.ones((4, 3)), np.broadcast_to(alpha, 4)[:, None]], axis=1).astype(np.float32)
+
+
+def test_glb_vertex_alpha_blends_as_factor_and_texture_do(tmp_path: Path) -> None:
+    plane = primitive_shape("plane")
+    write_glb(tmp_path / "half.glb", plane, [BLACK_BLEND], colors=rgba_of(0.5))
+    inside = np.abs(ACROSS) < 0.9
+    assert over_white(tmp_path, "half.glb")[inside].mean() == pytest.approx(0.5, abs=5e-3)
+    # base color factor x texture x vertex color
+    shading = {"baseColorFactor": [0, 0, 0, 0.5], "metallicFactor": 0, "baseColorTexture": {"index": 0}}
+    write_glb(
+        tmp_path / "all.glb", plane, [BLACK_BLEND | {"pbrMetallicRoughness": shading}],
+        [leaf(tmp_path, 0.8)], colors=rgba_of(0.5),
+    )  # fmt: skip
+    assert over_white(tmp_path, "all.glb")[inside].mean() == pytest.approx(1 - 0.5 * 0.8 * 0.5, abs=5e-3)
+    # opaque materials have no alpha, whatever their vertices hold
+    opaque = {key: value for key, value in BLACK_BLEND.items() if key != "alphaMode"}
+    write_glb(tmp_path / "opaque.glb", plane, [opaque], colors=rgba_of(0.5))
+    assert over_white(tmp_path, "opaque.glb")[inside].max() < 1e-6
+
+
+def test_glb_vertex_alpha_is_interpolated_and_cut(tmp_path: Path) -> None:
+    plane = primitive_shape("plane")
+    # corners at x = -1, 1, 1, -1
+    ramp = rgba_of([0.0, 1.0, 1.0, 0.0])
+    write_glb(tmp_path / "ramp.glb", plane, [BLACK_BLEND], colors=ramp)
+    seen = over_white(tmp_path, "ramp.glb", 4096)
+    within = np.abs(ACROSS) < 1
+    np.testing.assert_allclose(seen, np.where(within, 1 - (ACROSS + 1) / 2, 1.0), atol=0.03)
+    write_glb(tmp_path / "cut.glb", plane, [BLACK_BLEND | {"alphaMode": "MASK"}], colors=ramp)
+    seen = over_white(tmp_path, "cut.glb", 4)
+    np.testing.assert_allclose(seen, np.where(within & (ACROSS > 0), 0.0, 1.0), atol=1e-6)
+
+
+def test_glb_vertex_alpha_casts_its_share_of_shadow_and_light(tmp_path: Path) -> None:
+    plane = primitive_shape("plane")
+    ground = StageMesh(shape="plane", position=(0, -1, 0), scale=9, material=Diffuse(color_srgb=WHITE))
+    below = camera((-3, -0.5, 0), (0, -1, 0), (3, 3), 1e-3)
+
+    def lit(name: str, *lights: Any, samples: int = 4) -> float:
+        stage = Stage(
+            up=Y_UP, gaussians=(), meshes=(ground, StageMesh(file=name)), lights=lights,
+            integrator=Integrator(samples=samples, max_depth=1, anti_aliasing=False),
+        )  # fmt: skip
+        return float(film_of(stage, below, tmp_path).image().rgb_linear.mean())
+
+    sun = DirectionalLight(direction=(0, -1, 0), irradiance=np.pi)
+    for alpha in (0.0, 0.3, 1.0):
+        write_glb(tmp_path / "a.glb", plane, [BLACK_BLEND], colors=rgba_of(alpha))
+        assert lit("a.glb", sun) == pytest.approx(1 - alpha, abs=1e-5)
+    # what is not there does not shine
+    shining = BLACK_BLEND | {"emissiveFactor": [1, 1, 1]}
+    found = []
+    for alpha in (0.3, 1.0):
+        write_glb(tmp_path / "a.glb", plane, [shining], colors=rgba_of(alpha))
+        found.append(lit("a.glb", samples=1024))
+    assert found[1] > 0.1 and found[0] == pytest.approx(0.3 * found[1], rel=0.02)
+
+
 def test_opacity_texture_without_alpha_is_its_grey_unless_it_is_the_color(tmp_path: Path) -> None:
     write_png(tmp_path / "grey.png", np.full((2, 2, 3), 0.6, np.float32))
     write_png(tmp_path / "color.png", np.full((2, 2, 3), 0.6, np.float32))

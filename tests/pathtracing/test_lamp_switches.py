@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from octasplat.engine.pathtracing.stage.materials import Diffuse, Glass
 from octasplat.engine.pathtracing.stage.model import (
@@ -49,7 +50,7 @@ def darkening(*lights: Any, light: Any = "shadowed", meshes: tuple[StageMesh, ..
 
 def floor_radiance(lamp: Any, *meshes: StageMesh, depth: int = 1, samples: int = 4) -> float:
     numbers = Integrator(samples=samples, max_depth=depth, anti_aliasing=False)
-    stage = Stage(gaussians=(), meshes=(FLOOR, *meshes), lights=(lamp,), integrator=numbers)
+    stage = Stage(meshes=(FLOOR, *meshes), lights=(lamp,), integrator=numbers)
     return float(film_of(stage, BELOW).image().rgb_linear.mean())
 
 
@@ -61,13 +62,23 @@ def test_lamp_of_shadows_alone_darkens_gaussians_and_lights_nothing() -> None:
         0.25, abs=0.01
     )
     assert floor_radiance(DirectionalLight(direction=(0, 1, 0), irradiance=5, only_shadows=True)) == 0.0
-    # Relit Gaussians have nothing of it either: what is left is their ambient part.
-    np.testing.assert_allclose(darkening(sun(only_shadows=True), light="relit"), 0.25, atol=2e-3)
+
+
+def test_lamp_of_shadows_alone_needs_shadowed_gaussians() -> None:
+    lamp = sun(only_shadows=True)
+    # some are enough
+    scenes = (StageGaussians(light="relit"), StageGaussians(file="small.ply"))
+    Stage(gaussians=scenes, lights=(lamp,))
+    for light in ("relit", "emissive"):
+        with pytest.raises(ValidationError, match=r"shadows of lights\[0\] .* give \[\[gaussians\]\]"):
+            Stage(gaussians=(StageGaussians(light=light),), lights=(lamp,))
+    with pytest.raises(ValidationError, match="this stage has none"):
+        Stage(gaussians=(), lights=(lamp,))
 
 
 def test_lamp_of_shadows_alone_is_not_seen() -> None:
     ball = PointLight(position=(0, 0, 0), intensity=1, radius=0.5, only_shadows=True)
-    stage = Stage(gaussians=(), lights=(ball,), integrator=DIRECT)
+    stage = Stage(lights=(ball,), integrator=DIRECT)
     assert not film_of(stage, camera((0, 0, -4), (0, 0, 0), (5, 5), 5)).image().rgb_linear.any()
 
 

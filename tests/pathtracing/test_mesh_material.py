@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,8 +38,12 @@ def write_glb(
     of_faces: list[int] | None = None,
     node: dict[str, Any] | None = None,
     more: dict[str, Any] | None = None,
+    colors: np.ndarray | None = None,
 ) -> None:
-    """A GLB of a shape: a primitive for each material, and images 0, 1, ... as textures of these numbers."""
+    """A GLB of a shape: a primitive for each material, and images 0, 1, ... as textures of these numbers.
+
+    ``colors`` are linear, of the vertices, with or without alpha.
+    """
     document: dict[str, Any] = {
         "asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0, **(node or {})}],
         "materials": materials, "bufferViews": [], "accessors": [],
@@ -69,6 +74,8 @@ def write_glb(
         attributes = {"POSITION": accessor(shape.vertices[faces].reshape(-1, 3))}
         if shape.corner_uv is not None:
             attributes["TEXCOORD_0"] = accessor(shape.corner_uv[numbers == number].reshape(-1, 2))
+        if colors is not None:
+            attributes["COLOR_0"] = accessor(colors[faces].reshape(-1, colors.shape[1]))
         primitives.append({"attributes": attributes, "material": number})
     document["meshes"] = [{"primitives": primitives}]
     document["buffers"] = [{"byteLength": len(data)}]
@@ -146,6 +153,43 @@ def test_glb_material_and_textures_are_read(tmp_path: Path) -> None:
         StageMesh(file="twin.obj", up_axis="y", material=twin.model_copy(update={"normal_texture": None})),
     )
     assert np.abs(found - flat).max() > 0.02
+
+
+def test_glb_textured_clear_coat_is_that_of_two_halves(tmp_path: Path) -> None:
+    cube = primitive_shape("cube")
+    halves = [0] * 6 + [1] * 6
+    assert cube.corner_uv is not None
+    # the faces of each half lie in a half of the images, away from its borders
+    place = np.array([0.1, 0.6])[halves][:, None, None]
+    cube = replace(cube, corner_uv=(cube.corner_uv * 0.3 + place).astype(np.float32))
+    values = np.array([[51, 204, 9], [255, 102, 9]], np.float32) / 255  # red: share, green: roughness
+    write_png(tmp_path / "coat.png", np.tile(np.repeat(values, 8, axis=0), (16, 1, 1)))
+    image = (tmp_path / "coat.png").read_bytes()
+    shading = {"baseColorFactor": [0.3, 0.05, 0.05, 1], "metallicFactor": 0, "roughnessFactor": 0.8}
+
+    def coated(share: float, roughness: float, **textures: Any) -> dict[str, Any]:
+        coat = {"clearcoatFactor": share, "clearcoatRoughnessFactor": roughness, **textures}
+        return {"pbrMetallicRoughness": shading, "extensions": {"KHR_materials_clearcoat": coat}}
+
+    named = {"clearcoatTexture": {"index": 0}, "clearcoatRoughnessTexture": {"index": 0}}
+    write_glb(tmp_path / "textured.glb", cube, [coated(0.9, 0.7, **named)], [image])
+    constant = [coated(0.9 * float(red), 0.7 * float(green)) for red, green, _ in values]
+    write_glb(tmp_path / "split.glb", cube, constant, of_faces=halves)
+    write_glb(tmp_path / "plain.glb", cube, [coated(0.9, 0.7)])
+    said: list[str] = []
+    found = picture(tmp_path, StageMesh(file="textured.glb"), said=said.append)
+    assert said == []
+    split, plain = (picture(tmp_path, StageMesh(file=name)) for name in ("split.glb", "plain.glb"))
+    np.testing.assert_allclose(found, split, atol=1e-5)
+    assert np.abs(found - plain).max() > 0.02
+    # the same by a stage's own material
+    stated = MetallicRoughness(
+        color_srgb=tuple(linear_to_srgb(np.array([0.3, 0.05, 0.05])).tolist()), roughness=0.8, clear_coat=0.9,
+        clear_coat_texture="coat.png", clear_coat_roughness=0.7, clear_coat_roughness_texture="coat.png",
+    )  # fmt: skip
+    np.testing.assert_allclose(
+        picture(tmp_path, StageMesh(file="plain.glb", material=stated)), split, atol=1e-5
+    )
 
 
 def test_glb_materials_in_mirrored_node(tmp_path: Path) -> None:

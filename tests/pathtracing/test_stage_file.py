@@ -82,6 +82,11 @@ def test_stage_file_with_all_keys_is_read(tmp_path: Path) -> None:
             "only_shadows = true\nadds_light = true",
             "only_shadows casts shadows and adds no light",
         ),
+        (
+            '[[gaussians]]\nlight = "relit"\n[[lights]]\nkind = "point"\nposition = [0, 0, 0]\n'
+            "intensity = 1\nonly_shadows = true",
+            r'lights: the shadows of lights\[0\] .* light = "shadowed" alone, and this stage has none; give',
+        ),
         ('[[lights]]\nkind = "point"\nposition = [0, 0, 0]', r"lights\[0\].*intensity"),
         ('[[lights]]\nkind = "point"\nposition = [0, 0, 0]\nintensity = -1', r"lights\[0\]\.intensity"),
         ('[[lights]]\nkind = "directional"\ndirection = [0, 0, 0]\nirradiance = 1', "has no length"),

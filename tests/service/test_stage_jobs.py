@@ -104,6 +104,11 @@ BAD = [
         "[[lights]]\nkind='point'\nposition=[0,0,0]\nintensity=1\n" * 1001,
         "options", "#/options/stage/lights", "1000 items",
     ),
+    (
+        "[[gaussians]]\nlight='relit'\n"
+        "[[lights]]\nkind='point'\nposition=[0,0,0]\nintensity=1\nonly_shadows=true",
+        "options", "#/options/stage/lights", "stage.lights: the shadows of lights[0]",
+    ),
 ]  # fmt: skip
 
 

@@ -321,7 +321,7 @@ def train(
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize(
-    ("recipe", "stop_after"), [("split_sum", 40), ("split_sum", 50), ("ref_gaussian", 50)]
+    ("recipe", "stop_after"), [("split_sum", 40), ("split_sum", 50), ("ref_gaussian", 50), ("near_field", 50)]
 )
 def test_deferred_training_resumes_to_same_bytes_on_any_threads(
     tmp_path: Path, recipe: str, stop_after: int

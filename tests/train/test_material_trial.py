@@ -58,6 +58,7 @@ def test_long_training_with_useless_materials_is_warned_of(
     reconstruct(few_pixels, tmp_path / "run", config, threads=1, progress=events.append)
     warned = [event.message for event in events if isinstance(event, Warned)]
     assert sum("4.0 dB worse with materials than without" in message for message in warned) == told
+    assert sum("materials.recipe=near_field" in message for message in warned) == told
     assert any(isinstance(event, Noted) and "short trainings" in event.message for event in events) == (
         share == 0
     )

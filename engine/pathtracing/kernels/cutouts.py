@@ -1,10 +1,10 @@
 """Surfaces that rays pass: those with holes where nothing is there, and those of glass within other glass.
 
-A texture of opacities, as of a leaf, or one number, as of gauze. With a cutoff a place is there or not;
-without one its opacity is the probability with which a path meets it, and the share of light that it keeps
-off. A path passes what is not there as if there were no surface: its place, its direction and the number of
-surfaces that it has met stay as they are. So it passes surfaces of glass within glass that counts instead,
-see :mod:`octasplat.engine.pathtracing.kernels.nested_glass`.
+A texture of opacities, as of a leaf, the alpha of vertices, or one number, as of gauze. With a cutoff a place
+is there or not; without one its opacity is the probability with which a path meets it, and the share of light
+that it keeps off. A path passes what is not there as if there were no surface: its place, its direction and
+the number of surfaces that it has met stay as they are. So it passes surfaces of glass within glass that
+counts instead, see :mod:`octasplat.engine.pathtracing.kernels.nested_glass`.
 """
 
 import math
@@ -25,7 +25,7 @@ from octasplat.engine.pathtracing.kernels.nested_glass import (
 )
 from octasplat.engine.pathtracing.kernels.path_args import BLOCK_SIZE, Bounce, PathScratch
 from octasplat.engine.pathtracing.kernels.sampler import uniform_pair
-from octasplat.engine.pathtracing.kernels.surface import face_normal, interpolate_uv
+from octasplat.engine.pathtracing.kernels.surface import eval_vertex_alpha, face_normal, interpolate_uv
 from octasplat.engine.pathtracing.kernels.texture import eval_texture
 from octasplat.engine.trace.kernels.native import njit_no_refcount
 from octasplat.engine.trace.kernels.triangles import TriangleHitArrays, TriangleRays, closest_hits
@@ -41,13 +41,19 @@ RESTART_OFFSET = np.float32(1e-7)
 @njit_no_refcount(forceinline=True)
 def has_holes(materials: LightArrays | MaterialArrays, m: int) -> bool:
     """Return whether some of a material's surface may not be there."""
-    return materials.opacity_textures[m] >= 0 or materials.opacities[m] < 1.0
+    return (
+        materials.opacity_textures[m] >= 0
+        or materials.opacities[m] < 1.0
+        or materials.uses_vertex_alpha[m] != 0
+    )
 
 
 @njit_no_refcount(forceinline=True)
-def eval_opacity(materials: LightArrays | MaterialArrays, m: int, u: float, v: float) -> float:
-    """Return the share of a surface that is there at texture coordinates."""
-    opacity = materials.opacities[m]
+def eval_opacity(
+    materials: LightArrays | MaterialArrays, m: int, u: float, v: float, vertex_alpha: float
+) -> float:
+    """Return the share of a surface that is there at texture coordinates, where its corners have an alpha."""
+    opacity = materials.opacities[m] * vertex_alpha
     texture = materials.opacity_textures[m]
     if texture >= 0:
         opacity *= eval_texture(materials, texture, u, v)[0]
@@ -82,7 +88,8 @@ def _is_passed(bounce: Bounce, k: int, face: int, b: float, c: float, pair: int)
     if not has_holes(scene.materials, m):
         return False
     u, v = interpolate_uv(scene.surfaces.corner_uv[face], 1.0 - b - c, b, c)
-    opacity = eval_opacity(scene.materials, m, u, v)
+    alpha = eval_vertex_alpha(scene.surfaces, face, 1.0 - b - c, b, c)
+    opacity = eval_opacity(scene.materials, m, u, v, alpha)
     if opacity >= 1.0 or opacity <= 0.0:
         return opacity <= 0.0
     return uniform_pair(paths.keys[p], paths.samples[p], pair)[0] >= opacity

@@ -24,6 +24,7 @@ class SurfaceArrays(NamedTuple):
         corner_uv: texture coordinates at the corners, (0, 0) at the upper left.
         material_ids: row of each face in :class:`MaterialArrays`.
         corner_rgb_linear: colors of the corners; no rows at all where no mesh has any.
+        corner_alpha: factor of the opacity at the corners; likewise.
     """
 
     corners_world: Float32[np.ndarray, "f 3 3"]
@@ -31,6 +32,7 @@ class SurfaceArrays(NamedTuple):
     corner_uv: Float32[np.ndarray, "f 3 2"]
     material_ids: Int32[np.ndarray, " f"]
     corner_rgb_linear: Float32[np.ndarray, "g 3 3"]
+    corner_alpha: Float32[np.ndarray, "h 3"]
 
 
 class MaterialArrays(NamedTuple):
@@ -45,6 +47,8 @@ class MaterialArrays(NamedTuple):
         absorption: per world unit.
         clear_coats: share of the surface under a clear coat.
         clear_coat_roughness: perceptual.
+        clear_coat_textures: number of a texture, -1 for none.
+        clear_coat_roughness_textures: likewise.
         priorities: of glass in glass, -1 for none.
         substrates: how the ground shares light with the coat.
         energy_compensation: whether light that facets throw at each other is kept.
@@ -52,6 +56,7 @@ class MaterialArrays(NamedTuple):
         opacities: share of the surface that is there, times that of the texture.
         opacity_textures: number of a texture, -1 for none.
         opacity_cutoffs: the surface is there where the opacity reaches this, else not; -1 for none.
+        uses_vertex_alpha: whether the opacity changes with the corners.
         color_textures: number of a texture, -1 for none.
         metallic_roughness_textures: likewise.
         normal_textures: likewise.
@@ -73,6 +78,8 @@ class MaterialArrays(NamedTuple):
     absorption: Float64[np.ndarray, "m 3"]
     clear_coats: Float64[np.ndarray, " m"]
     clear_coat_roughness: Float64[np.ndarray, " m"]
+    clear_coat_textures: Int32[np.ndarray, " m"]
+    clear_coat_roughness_textures: Int32[np.ndarray, " m"]
     priorities: Int32[np.ndarray, " m"]
     substrates: Int32[np.ndarray, " m"]
     energy_compensation: Int32[np.ndarray, " m"]
@@ -80,6 +87,7 @@ class MaterialArrays(NamedTuple):
     opacities: Float64[np.ndarray, " m"]
     opacity_textures: Int32[np.ndarray, " m"]
     opacity_cutoffs: Float64[np.ndarray, " m"]
+    uses_vertex_alpha: Int32[np.ndarray, " m"]
     color_textures: Int32[np.ndarray, " m"]
     metallic_roughness_textures: Int32[np.ndarray, " m"]
     normal_textures: Int32[np.ndarray, " m"]
@@ -113,13 +121,15 @@ class LightArrays(NamedTuple):
         lights_meshes: whether it lights meshes, and Gaussians with materials.
         casts_shadows: whether anything keeps it off.
         textures: of meshes, -1 for none.
-        opacities: of meshes, see :class:`MaterialArrays`, as the next two.
+        opacities: of meshes, see :class:`MaterialArrays`, as the next three.
         opacity_textures: number of a texture, -1 for none.
         opacity_cutoffs: -1 for none.
+        uses_vertex_alpha: whether the opacity changes with the corners.
         mesh_rows: of meshes: first and last row of their sums, and first triangle.
         mesh_cdf: cumulative shares of the triangles' areas, from 0 to 1 for each mesh.
         mesh_corners_world: of the triangles of all meshes.
         mesh_uv: likewise.
+        mesh_alpha: likewise, factor of the opacity at the corners.
         texels_linear: see :class:`MaterialArrays`, as the next one.
         texture_sizes: first texel, height and width of each.
         environment_linear: the map, one black pixel without one.
@@ -149,10 +159,12 @@ class LightArrays(NamedTuple):
     opacities: Float64[np.ndarray, " l"]
     opacity_textures: Int32[np.ndarray, " l"]
     opacity_cutoffs: Float64[np.ndarray, " l"]
+    uses_vertex_alpha: Int32[np.ndarray, " l"]
     mesh_rows: Int64[np.ndarray, "l 3"]
     mesh_cdf: Float64[np.ndarray, " s"]
     mesh_corners_world: Float32[np.ndarray, "f 3 3"]
     mesh_uv: Float32[np.ndarray, "f 3 2"]
+    mesh_alpha: Float32[np.ndarray, "f 3"]
     texels_linear: Float32[np.ndarray, "x 3"]
     texture_sizes: Int64[np.ndarray, "k 3"]
     environment_linear: Float32[np.ndarray, "h w 3"]

@@ -248,7 +248,8 @@ def _sample_mesh(
     t_u, t_v = interpolate_uv(uv, a, b, c)
     red, green, blue = eval_emission(lights, l, t_u, t_v)
     if has_holes(lights, l):
-        share = eval_opacity(lights, l, t_u, t_v)
+        alpha = lights.mesh_alpha[face]
+        share = eval_opacity(lights, l, t_u, t_v, a * alpha[0] + b * alpha[1] + c * alpha[2])
         red, green, blue = share * red, share * green, share * blue
     return way_x, way_y, way_z, distance, red, green, blue, squared / (cosine * lights.areas[l])
 

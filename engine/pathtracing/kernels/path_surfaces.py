@@ -53,6 +53,7 @@ from octasplat.engine.pathtracing.kernels.surface import (
     EMITTER,
     GLASS,
     MIRROR,
+    eval_clear_coat,
     eval_material,
     eval_normal_map,
     eval_vertex_color,
@@ -174,10 +175,11 @@ def _scatter_at_material(
     if is_guide:
         _write_denoiser_guides(paths, p, red, green, blue, s_x, s_y, s_z)
     table = materials.coat_tables[m]
+    coat, coat_roughness = eval_clear_coat(materials, m, u_t, v_t)
     bsdf = Bsdf(
         (red, green, blue), metallic, roughness,
         materials.iors[m], materials.substrates[m], materials.energy_compensation[m] != 0,
-        materials.clear_coats[m], materials.clear_coat_roughness[m],
+        coat, coat_roughness,
     )  # fmt: skip
     tables = AlbedoTables(
         materials.ggx_albedo, materials.coat_albedo[table], materials.coat_mean_albedo[table],

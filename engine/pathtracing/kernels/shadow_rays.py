@@ -18,7 +18,12 @@ from octasplat.engine.pathtracing.kernels.nested_glass import (
 from octasplat.engine.pathtracing.kernels.path_args import BLOCK_SIZE, PathScratch, ShadowRayArrays
 from octasplat.engine.pathtracing.kernels.principled_bsdf import fresnel_dielectric
 from octasplat.engine.pathtracing.kernels.rough_dielectric import MIN_GLASS_ROUGHNESS
-from octasplat.engine.pathtracing.kernels.surface import GLASS, face_normal, interpolate_uv
+from octasplat.engine.pathtracing.kernels.surface import (
+    GLASS,
+    eval_vertex_alpha,
+    face_normal,
+    interpolate_uv,
+)
 from octasplat.engine.trace.kernels.native import njit_no_refcount
 from octasplat.engine.trace.kernels.triangles import (
     EmbreeQuery,
@@ -190,7 +195,8 @@ def _trace_filters(
             else:
                 b, c = float(scratch.barycentrics[i, 0]), float(scratch.barycentrics[i, 1])
                 u, v = interpolate_uv(surfaces.corner_uv[face], 1.0 - b - c, b, c)
-                share = 1.0 - eval_opacity(materials, m, u, v)
+                alpha = eval_vertex_alpha(surfaces, face, 1.0 - b - c, b, c)
+                share = 1.0 - eval_opacity(materials, m, u, v, alpha)
                 for channel in range(3):
                     transmittance[k, channel] *= share
                 if share <= 0.0:

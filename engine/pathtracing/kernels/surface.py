@@ -71,11 +71,13 @@ def offset_ray_origin(
 
 @njit_no_refcount(forceinline=True, fastmath={"contract"})
 def has_textures(materials: MaterialArrays, m: int) -> bool:
-    """Return whether :func:`eval_material` or :func:`eval_normal_map` reads a texture."""
+    """Return whether :func:`eval_material`, :func:`eval_clear_coat` or :func:`eval_normal_map` reads one."""
     return (
         materials.color_textures[m] >= 0
         or materials.metallic_roughness_textures[m] >= 0
         or materials.normal_textures[m] >= 0
+        or materials.clear_coat_textures[m] >= 0
+        or materials.clear_coat_roughness_textures[m] >= 0
     )
 
 
@@ -100,6 +102,29 @@ def eval_material(
         # channels as in glTF: green is roughness, blue metallic
         roughness, metallic = roughness * t_g, metallic * t_b
     return red, green, blue, metallic, roughness
+
+
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
+def eval_clear_coat(materials: MaterialArrays, m: int, u: float, v: float) -> tuple[float, float]:
+    """Return the share of the clear coat of material ``m`` at texture coordinates, and its roughness."""
+    share, roughness = materials.clear_coats[m], materials.clear_coat_roughness[m]
+    # channels as in glTF: red is the share, green the roughness
+    texture = materials.clear_coat_textures[m]
+    if texture >= 0:
+        share *= eval_texture(materials, texture, u, v)[0]
+    texture = materials.clear_coat_roughness_textures[m]
+    if texture >= 0:
+        roughness *= eval_texture(materials, texture, u, v)[1]
+    return share, roughness
+
+
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
+def eval_vertex_alpha(surfaces: SurfaceArrays, face: int, a: float, b: float, c: float) -> float:
+    """Return the alpha of the corners of a face at a place, 1 where no mesh has any of its own."""
+    if len(surfaces.corner_alpha) == 0:
+        return 1.0
+    alpha = surfaces.corner_alpha[face]
+    return a * alpha[0] + b * alpha[1] + c * alpha[2]
 
 
 @njit_no_refcount(forceinline=True, fastmath={"contract"})

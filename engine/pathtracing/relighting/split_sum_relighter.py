@@ -10,7 +10,7 @@ from octasplat.engine.pathtracing.environment import EnvironmentMap
 from octasplat.engine.pathtracing.relighting.relighter import ProgressCallback, RelitImage, no_progress
 from octasplat.engine.render.supersampling import pixel_means
 from octasplat.engine.shading.material_settings import MaterialSettings
-from octasplat.engine.shading.recipes import material_shading
+from octasplat.engine.shading.recipes import relighting_shading
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import TraceSettings
 
@@ -50,7 +50,7 @@ class SplitSumRelighter:
             "indirect": "shaded",
         }
         shading = (material_settings or MaterialSettings()).model_copy(update=changed)
-        self._shading = material_shading(shading.recipe)(
+        self._shading = relighting_shading(shading.recipe)(
             shading, extent_world=extent_world, one_sided=settings.flip_normal_cos > 0
         )
         self._gaussians = with_interreflection_channel(gaussians)

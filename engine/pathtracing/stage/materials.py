@@ -53,11 +53,15 @@ class ClearCoated(StageModel):
 
     Attributes:
         clear_coat: share of the surface that has it.
+        clear_coat_texture: image file whose red is multiplied by it.
         clear_coat_roughness: perceptual, GGX's alpha is its square.
+        clear_coat_roughness_texture: image file whose green is multiplied by it.
     """
 
     clear_coat: UnitInterval = 0.0
+    clear_coat_texture: str | None = None
     clear_coat_roughness: UnitInterval = 0.0
+    clear_coat_roughness_texture: str | None = None
 
 
 class Diffuse(NormalMapped, Emissive, Cutout):

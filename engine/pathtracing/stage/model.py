@@ -6,9 +6,9 @@ are linear. Imports neither torch nor numba.
 """
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from octasplat.engine.pathtracing.stage.base import (
     WHITE,
@@ -102,7 +102,8 @@ class LightModel(StageModel):
             and they only lose it where something new is in its way.
         lights_meshes: whether it lights meshes, and Gaussians with materials; it is seen all the same.
         casts_shadows: whether anything keeps it off. Without shadows it takes nothing from Gaussians.
-        only_shadows: it is not seen and lights nothing; only its shadows fall on shadowed Gaussians.
+        only_shadows: it is not seen and lights nothing; only its shadows fall on shadowed Gaussians, of which
+            the stage needs some.
         keys: where it is in single images of a film.
     """
 
@@ -320,6 +321,22 @@ class Stage(StageModel):
     lights: Annotated[tuple[Light, ...], Field(max_length=MAX_LIGHTS)] = ()
     environment: Environment | None = None
     integrator: Integrator = Integrator()
+
+    @field_validator("lights")
+    @classmethod
+    def _check_shadows_fall(cls, lights: tuple[Light, ...], info: Any) -> tuple[Light, ...]:
+        # unknown where they are refused themselves
+        gaussians = info.data.get("gaussians")
+        if gaussians is None or any(scene.light == "shadowed" for scene in gaussians):
+            return lights
+        for number, light in enumerate(lights):
+            if light.only_shadows:
+                raise ValueError(
+                    f"the shadows of lights[{number}] (only_shadows) fall on Gaussians with light = "
+                    '"shadowed" alone, and this stage has none; give [[gaussians]] this light, or leave the '
+                    "lamp out"
+                )
+        return lights
 
     @model_validator(mode="after")
     def _check_up(self) -> "Stage":

@@ -18,6 +18,7 @@ from octasplat.engine.pathtracing.stage.stage_errors import stage_error
 MAX_STAGE_BYTES = 16 << 20
 TEXTURE_KEYS = (
     "texture", "metallic_roughness_texture", "normal_texture", "emission_texture", "opacity_texture",
+    "clear_coat_texture", "clear_coat_roughness_texture",
 )  # fmt: skip
 """Keys of materials that name images."""
 

@@ -12,6 +12,7 @@ from octasplat.engine.core.errors import CancelledError
 from octasplat.engine.core.threads import use_threads
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.shading.material_settings import Recipe
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import Tracer
@@ -89,6 +90,7 @@ def train_coarse_scene(
 def material_gain_db(
     dataset: Dataset,
     *,
+    recipe: Recipe = "split_sum",
     background: Background,
     seed: int,
     threads: int,
@@ -101,6 +103,7 @@ def material_gain_db(
 
     Args:
         dataset: the photographs; pixels of the training views stand in where none are held out.
+        recipe: of the materials.
         background: what lies behind everything.
         seed: of everything random.
         threads: of the trainings; 0 means all cores.
@@ -113,7 +116,9 @@ def material_gain_db(
     color = evaluation_background(background)
     probe = draw_probe(dataset, indices, MATERIAL_PROBE_RAYS, color, np.random.default_rng(seed))
     found = []
-    for base in (preset("fast"), with_materials(preset("fast"))):
+    lit = with_materials(preset("fast"))
+    lit = lit.model_copy(update={"materials": lit.materials.model_copy(update={"recipe": recipe})})
+    for base in (preset("fast"), lit):
         config = base.model_copy(update={**MATERIAL_TRIAL_SETTINGS, "background": background, "seed": seed})
         gaussians, shading = _train(
             dataset=dataset,
