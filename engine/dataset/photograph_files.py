@@ -14,12 +14,16 @@ def image_folder(root: Path) -> Path:
     """Return ``images/`` or ``input/`` of a scene, or the scene itself where neither holds photographs."""
     folders = [root / name for name in _PHOTOGRAPH_FOLDERS if (root / name).is_dir()]
     elsewhere = root if not folders or _holds_photographs(root) else folders[0]
-    return next((folder for folder in folders if _holds_photographs(folder)), elsewhere)
+    return next(
+        (folder for folder in folders if not is_run_folder(folder) and _holds_photographs(folder)), elsewhere
+    )
 
 
 def _holds_photographs(folder: Path) -> bool:
-    names = (path.relative_to(folder).as_posix() for path in folder.rglob("*"))
-    return any(is_photograph(_within(folder) + name) and not is_ignored_file(name) for name in names)
+    """Return whether photographs lie in a folder that are no results of a run below it."""
+    return any(
+        is_photograph(_within(folder) + name) and not is_ignored_file(name) for name in files_below(folder)
+    )
 
 
 def _within(folder: Path) -> str:

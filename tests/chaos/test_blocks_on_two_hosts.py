@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from octasplat.engine.pipeline import BlockRequest, reconstruct
-from octasplat.workers.db.live_scenes import get_live_scene
+from octasplat.workers.db.live_scenes import get_shown_scene
 from octasplat.workers.db.rows import Job
 from octasplat.workers.queue.block_jobs import blocks_of
 from octasplat.workers.worker.dataset_folder import FILLED_BY_NEED
@@ -68,8 +68,8 @@ def test_block_job_is_completed_by_the_host_that_lives(two: Hosts, tmp_path: Pat
     assert there == SHOWN[busy[HOSTS[second]].options["number"]] and len(list(place.iterdir())) == 16
 
     # The coarse scene is what the job shows meanwhile.
-    shown = bench.run_query(lambda c: get_live_scene(c, root))
-    assert shown is not None and shown.step == 120
+    shown = bench.run_query(lambda c: get_shown_scene(c, root))
+    assert shown is not None and shown.scene.step == 120
 
     two.found[first].disconnect()
     kill_tree(workers[first])

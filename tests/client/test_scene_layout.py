@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -147,6 +147,17 @@ def test_folder_archive_and_search_take_the_same_photographs(kind: str, tmp_path
     assert {name for name in names if name.startswith("images/")} == {f"images/{name}" for name in expected}
 
 
+@pytest.mark.parametrize("place", ["images/", "images/left/"])
+def test_results_of_a_run_in_the_images_folder_do_not_hide_photographs_beside_it(
+    place: str, tmp_path: Path
+) -> None:
+    paths = [*PHOTOGRAPHS, *(place + name for name in ("render.png", "config.json", "events.jsonl"))]
+    write_files(tmp_path, paths)
+    told = by_folder(paths)
+    assert told == by_archive(paths) == by_run(tmp_path)
+    assert told.photographs == frozenset(PHOTOGRAPHS) and not told.refusals
+
+
 def test_folders_behind_links_belong_to_the_scene(tmp_path: Path) -> None:
     """As a reconstruction here reads them; a link to a folder around it leads nowhere."""
     write_files(tmp_path / "card", PHOTOGRAPHS)
@@ -203,6 +214,8 @@ def test_all_doors_take_leave_out_and_refuse_the_same(
 ) -> None:
     paths += [f"{photographs}view_{number}.png" for number in range(count)]
     paths = [outer + path for path in paths]
+    # In a ZIP file a backslash ends the name of a folder, which is left out of names where all lies in it.
+    assume(not all(path.startswith("back\\") for path in paths))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         write_files(folder, paths)
