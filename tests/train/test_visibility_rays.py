@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from octasplat.engine.core.events import ignore_events
 from octasplat.engine.dataset.camera import Camera
 from octasplat.engine.dataset.model import Observations, SparsePoints
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
@@ -131,6 +132,23 @@ def test_batches_have_lines_where_they_count_and_none_of_views_left_out() -> Non
     lines = source.draw(rng).visibility_rays
     assert lines is not None
     assert len(np.unique(lines.origins_world, axis=0)) == 4
+
+
+def test_refined_poses_leave_the_lines_of_sight(tmp_path: Path) -> None:
+    ends = {}
+    for weight in (0.0, 0.1):
+        world = SeenWorld()
+        config = TrainConfig(
+            iterations=5, rays_per_batch=256, plane_sweep_init=False, refine_poses=True,
+            visibility_ray_fraction=0.25, loss=LossWeights(free_space=weight),
+        )  # fmt: skip
+        state = initial_state(world.initial_gaussians(count=60, painted=True, opacity=0.3), seed=0)
+        state.gaussians.means_world[:, 2] = -0.6
+        trainer = Trainer(
+            world, config, state, folder=tmp_path / str(weight), fingerprint="", progress=ignore_events
+        )
+        ends[weight] = trainer.run().opacity_logits.mean()
+    assert ends[0.1] < ends[0.0] - 1e-3  # what hides the points becomes less opaque
 
 
 def _counting(share: float) -> TrainConfig:

@@ -111,6 +111,7 @@ class Trainer:
         self._pose_refiner = (
             make_pose_refiner(dataset, self._background_srgb) if config.refine_poses else None
         )
+        given = dataset
         if self._pose_refiner is not None:
             dataset = self._pose_refiner.dataset
             if len(state.pose_corrections):
@@ -118,7 +119,7 @@ class Trainer:
             else:
                 state.pose_corrections = np.zeros((len(dataset.views), 6))
         self._dataset = dataset
-        self._batches = BatchSource(dataset, BatchOptions.from_config(config, dataset))
+        self._batches = BatchSource(dataset, BatchOptions.from_config(config, dataset), observed=given)
         pixels, valid = self._batches.sampler.pixel_count, valid_pixel_fraction(dataset)
         # its length first: rates and the strategy depend on it
         self.schedule = Schedule.from_config(config, iteration_count(config, pixels, valid))

@@ -117,12 +117,16 @@ class BatchSource:
     Args:
         dataset: the photographs.
         options: sizes and shares.
+        observed: the photographs at the poses of the model, which visibility rays keep; None takes
+            ``dataset``.
 
     Raises:
         ConfigError: the SSIM term would have no patch, or a background is to be learnt where none is shown.
     """
 
-    def __init__(self, dataset: TrainingData, options: BatchOptions) -> None:
+    def __init__(
+        self, dataset: TrainingData, options: BatchOptions, *, observed: TrainingData | None = None
+    ) -> None:
         if options.background == "learnt" and dataset.has_alpha:
             raise ConfigError(
                 "These photographs have alpha, so that they show no background; leave background=learnt out."
@@ -134,8 +138,9 @@ class BatchSource:
         self._reads_depths = options.reads_depths and has_known_distances(dataset)
         self._visibility_rays: VisibilityRays | None = None
         needs_visibility_rays = options.visibility_ray_fraction > 0
-        if needs_visibility_rays and isinstance(dataset, ObservedPoints) and len(dataset.points):
-            self._visibility_rays = VisibilityRays.from_dataset(dataset, VISIBILITY_RAY_MARGIN)
+        observed = dataset if observed is None else observed
+        if needs_visibility_rays and isinstance(observed, ObservedPoints) and len(observed.points):
+            self._visibility_rays = VisibilityRays.from_dataset(observed, VISIBILITY_RAY_MARGIN)
 
     def exclude_views(self, views: Int64[np.ndarray, " m"]) -> None:
         """Draw nothing of these views any more."""
