@@ -22,6 +22,7 @@ from octasplat.engine.train.sampling.batches import grid_pixels
 from octasplat.engine.train.sampling.pixel_sampler import view_sizes_px
 from octasplat.engine.train.views.corrected_views import correct_view, remove_common_motion
 from octasplat.engine.train.views.image_alignment import (
+    PhotographSamples,
     RenderedPoints,
     RigidMotion,
     align_camera,
@@ -246,3 +247,30 @@ def test_mirrors_and_photographs_without_cameras_are_refused(tmp_path: Path) -> 
             fingerprint="",
             progress=ignore_events,
         )
+
+
+def test_panorama_with_as_much_ahead_as_behind_is_aligned() -> None:
+    """Looking out of a painted ball, of radius 3, whose middle the camera is not quite in."""
+    camera = Camera("EQUIRECTANGULAR", (512.0, 256.0), 512, 256)
+    shift = np.array([0.03, -0.02, 0.025])
+    waves = np.array([[1, 0.4, 0.3], [0.2, 1, -0.5], [-0.3, 0.5, 1]])
+
+    def colors(points: np.ndarray) -> np.ndarray:
+        return 0.5 + 0.3 * np.sin(1.3 * points @ waves.T + np.arange(3))
+
+    def seen(pixels: np.ndarray) -> np.ndarray:
+        ways = camera.directions_cam(pixels)
+        along = ways @ shift
+        return colors((np.sqrt(along**2 - shift @ shift + 9) + along)[:, None] * ways - shift)
+
+    def photograph(pixels: np.ndarray) -> PhotographSamples:
+        inside = ((pixels > 2) & (pixels < [510, 254])).all(axis=1)
+        pixels = np.where(inside[:, None], pixels, 5.0)
+        slopes = [seen(pixels + step) - seen(pixels - step) for step in ([0.5, 0.0], [0.0, 0.5])]
+        return PhotographSamples(seen(pixels), np.stack(slopes, axis=-1), inside)
+
+    points = np.random.default_rng(1).normal(size=(3000, 3))
+    points *= 3 / np.linalg.norm(points, axis=1, keepdims=True)
+    found = align_camera(RenderedPoints(points, colors(points)), photograph, camera)
+    assert found is not None
+    np.testing.assert_allclose(found.to_vector, [0, 0, 0, *shift], atol=2e-3)

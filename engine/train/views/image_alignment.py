@@ -145,7 +145,9 @@ def align_camera(rendered: RenderedPoints, photograph: PhotographFn, camera: Cam
     points = rendered.points_cam
     if len(points) < MIN_POINTS:
         return None
-    depth = float(np.median(points[:, 2]))
+    # around a panorama depths along the axis have both signs
+    away = np.linalg.norm(points, axis=1) if camera.is_panorama else points[:, 2]
+    depth = float(np.median(away))
     motion = RigidMotion.from_vector(np.zeros(6))
     before = now = _compare(rendered, photograph(camera.project(points)))
     for _ in range(GAUSS_NEWTON_STEPS):
