@@ -190,7 +190,10 @@ def _named_masks(folder: Path, masks: Mapping[str, str], warnings: list[str]) ->
     root = folder.parent if folder.name in ("images", "input") else folder
     on_disk = {f"masks/{name}": path for name, path in files_below(root / "masks").items()}
     on_disk |= {f"{folder.name}/{name}": path for name, path in files_below(folder).items()}
-    paths = {name: PurePosixPath(path.replace("\\", "/")).as_posix() for name, path in masks.items()}
+    paths = {
+        name: PurePosixPath(normalize_name(path).replace("\\", "/")).as_posix()
+        for name, path in masks.items()
+    }
     there = {name: on_disk[path] for name, path in paths.items() if path in on_disk}
     gone = [masks[name] for name in masks if name not in there]
     if gone:

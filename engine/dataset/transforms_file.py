@@ -197,11 +197,11 @@ def _unsized_photographs(files: Sequence[_File]) -> list[str]:
 
 def _lens_values(file: _File, frame: _Frame) -> dict[str, Any]:
     """Return the values of a frame's lens that are given, for it or for all frames."""
-    return {
-        key: value
-        for key in _LENS_KEYS
-        if (value := getattr(file, key) if getattr(frame, key) is None else getattr(frame, key)) is not None
-    }
+    own = {key: value for key in _LENS_KEYS if (value := getattr(frame, key)) is not None}
+    common = {key: value for key in _LENS_KEYS if (value := getattr(file, key)) is not None}
+    if own.keys() & {"camera_angle_x", "camera_angle_y"}:  # instead of the focal lengths of the file
+        common = {key: value for key, value in common.items() if key not in ("fl_x", "fl_y")}
+    return common | own
 
 
 def _camera_of_frame(

@@ -3,6 +3,7 @@
 import json
 import math
 import shutil
+import unicodedata
 from collections.abc import Callable, Iterator, KeysView
 from pathlib import Path
 from typing import Any
@@ -198,6 +199,28 @@ def test_points_that_are_not_there_are_told(scene: Path) -> None:
     _write(root, _frames(load_dataset_model(scene)), **_PINHOLE, ply_file_path="sparse_pc.ply")
     found = load_dataset_model(root)
     assert len(found.points) == 0 and any("sparse_pc.ply, which is not there" in s for s in found.warnings)
+
+
+def test_the_angle_of_a_photograph_comes_before_the_focal_length_of_all(scene: Path) -> None:
+    root = _copy(scene, "other")
+    frames = _frames(load_dataset_model(scene))
+    frames[1]["camera_angle_x"] = 2 * math.atan(16 / 40)
+    _write(root, frames, w=32, h=24, fl_x=30.0, fl_y=31.0)
+    found = load_dataset_model(root)
+    seen = [
+        found.cameras[view.camera_index].directions_cam(np.array([[32.0, 12.0]]))[0] for view in found.views
+    ]
+    assert [way[0] / way[2] for way in seen[:3]] == pytest.approx([16 / 30, 16 / 40, 16 / 30])
+
+
+def test_masks_are_found_however_their_names_are_spelt(scene: Path, save_image: Callable[..., None]) -> None:
+    root = _copy(scene, "other")
+    frames = _frames(load_dataset_model(scene))
+    save_image(root / "masks" / unicodedata.normalize("NFC", "mä.png"), np.full((24, 32, 1), 255, np.uint8))
+    frames[0]["mask_path"] = unicodedata.normalize("NFD", "masks/mä.png")
+    _write(root, frames, **_PINHOLE)
+    found = load_dataset_model(root)
+    assert found.views[0].mask_path is not None and not any("masks that" in told for told in found.warnings)
 
 
 def test_masks_and_unused_values(scene: Path, save_image: Callable[..., None]) -> None:
