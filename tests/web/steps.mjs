@@ -196,6 +196,30 @@ const steps = {
         return found;
     },
 
+    /** One file of a folder is refused while others are on their way; how many are begun after that is told. */
+    async refused() {
+        const page = await open();
+        let begun = 0, late = 0, isTold = false;
+        await page.route("**/v1/datasets/**", async (route) => {
+            const request = route.request();
+            if (request.method() !== "PUT") return route.continue();
+            begun += 1;
+            late += isTold;
+            const isBad = request.url().endsWith("bad.png");
+            if (!isBad) await new Promise((resolve) => setTimeout(resolve, isTold ? 0 : 2000)); // on their way until the other is refused
+            return route.continue().catch(() => {});
+        });
+        await page.goto(`${job.url}/new`);
+        await page.setInputFiles("#pick-folder", job.chosen);
+        await page.waitForFunction(() => document.getElementById("chosen-text").textContent);
+        await page.click("#start");
+        await page.waitForFunction(() => !document.getElementById("faults").hidden);
+        isTold = true;
+        const faults = await page.locator("#faults li").allTextContents();
+        await page.waitForTimeout(2500); // the first try again would come after 0.6 s
+        return { begun, late, faults, going: await page.isVisible("#going") };
+    },
+
     /** A job that waits, runs and ends while its page and the list are open; nothing is reloaded by hand. */
     async watch() {
         const page = await open(), list = await open();

@@ -73,3 +73,16 @@ def test_large_archive_goes_on_in_parts(
     parts = {f"uploads/ID/parts/{start}" for start in range(0, Path(archive).stat().st_size, PART_BYTES)}
     assert len(begun) == 3 and not set(begun) & set(rest) and set(begun) | set(rest) == parts
     assert sorted(digests(service, found["jobs"][0])) == [f"images/{n}.png" for n in ("a", "b", "c", "large")]
+
+
+def test_others_are_not_sent_again_where_one_file_is_refused(
+    service: RunningService, browse: Browse, tmp_path: Path
+) -> None:
+    random = np.random.default_rng(6)
+    (tmp_path / "photos").mkdir()
+    for name in "abc":
+        write_photograph(tmp_path / "photos" / f"{name}.png", random.integers(0, 256, (40, 40, 3), np.uint8))
+    (tmp_path / "photos" / "bad.png").write_bytes(b"no picture")
+    found = browse("refused", service.url, chosen=str(tmp_path / "photos"))
+    assert found["begun"] >= 2 and found["late"] == 0 and not found["going"]
+    assert any("bad.png" in fault for fault in found["faults"])

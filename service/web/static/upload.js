@@ -23,6 +23,7 @@ export class Upload {
         this.places = PARALLEL; // requests that may be begun
         this.waiting = [];
         this.paused = null;
+        this.isOver = false; // one file was refused: the others are not tried again
         this.worker = new Worker(new URL("./digest_worker.js", import.meta.url), { type: "module" });
         this.asked = new Map();
         this.worker.onmessage = ({ data }) => {
@@ -131,6 +132,7 @@ export class Upload {
         try {
             await Promise.all(Array.from({ length: PARALLEL }, work));
         } catch (error) {
+            this.isOver = true;
             waiting.length = 0;
             this.running.forEach((request) => request.abort());
             throw error;
@@ -217,6 +219,7 @@ export class Upload {
                 return await action();
             } catch (error) {
                 const passing = error instanceof TypeError || [408, 429, 502, 503, 504].includes(error.status);
+                if (this.isOver) throw error;
                 if (this.paused) {
                     attempt = 0;
                     continue;
