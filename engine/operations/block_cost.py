@@ -90,7 +90,7 @@ def estimate_blocks(
         update={"train": coarse_settings(config.train), "max_side": coarse_side_px(longest)}
     )
     coarse = estimate_reconstruction(smaller, photographs, cores)
-    coarse_count = max_gaussian_count(smaller.train, training_pixels(config, photographs))
+    coarse_count = max_gaussian_count(smaller.train, training_pixels(smaller, photographs))
     # Blocks that are alike, as thousands of an even guess, are reckoned once.
     total_count = sum(sizes.count for sizes in photographs)
     found = {
@@ -101,20 +101,12 @@ def estimate_blocks(
     block_bytes = [cost.memory_bytes for cost in costs]
     # A block's rays meet the coarse Gaussians around it, and the last piece's those of all blocks.
     alone = [cost.stage_seconds["train"] for cost in costs]
+    around = [round((1 - block.share) * coarse_count) for block in shares]
     merged_count = round(sum(counts) / max(1.0, sum(block.share for block in shares)))
-    block_seconds, last_pieces = (
-        [
-            seconds * ray_cost_growth(config.train, count, max(count, seen))
-            for seconds, count, seen in zip(alone, counts, all_seen, strict=True)
-        ]
-        for all_seen in (
-            [
-                count + round((1 - block.share) * coarse_count)
-                for count, block in zip(counts, shares, strict=True)
-            ],
-            [merged_count] * len(shares),
-        )
-    )
+    block_seconds, last_pieces = [], []
+    for seconds, count, others in zip(alone, counts, around, strict=True):
+        block_seconds.append(seconds * ray_cost_growth(config.train, count, count + others))
+        last_pieces.append(seconds * ray_cost_growth(config.train, count, max(count, merged_count)))
     costs = tuple(
         cost.model_copy(
             update={
