@@ -35,7 +35,6 @@ PAGE = """<!doctype html>
 import { PerspectiveCamera } from "/files/vendor/three.js";
 import { readHdr } from "/files/viewer/environment.js";
 import { SplatRenderer, Sorting } from "/files/viewer/splats.js";
-from tests.support.daily import some_daily
 window.result = (async () => {
   const job = JOB;
   const view = new SplatRenderer(document.querySelector("canvas"));
