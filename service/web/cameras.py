@@ -7,7 +7,7 @@ left out.
 
 import io
 import struct
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import IO, Any
@@ -19,7 +19,7 @@ from octasplat.engine.render.upright import estimate_up
 
 MAX_CAMERAS = 20_000
 MAX_VIEWS = 400
-"""Most views that the viewer offers; of more, every N-th."""
+"""Most views that the viewer offers; more are thinned evenly."""
 _MAX_NAME_BYTES = 4096
 _PARAMETER_COUNTS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 10: 12}
 """Number of parameters by COLMAP's camera model number."""
@@ -129,9 +129,7 @@ def viewer_cameras(
     if np.median(depth) < 0.1 * spread:
         target, depth = ahead, np.einsum("ij,ij->i", ahead - centres, forwards)
     held = set(held_out)
-    # Every N-th of many, and in any case those that are held out.
-    step = -(-len(poses) // MAX_VIEWS)
-    selected = [pose for k, pose in enumerate(poses) if k % step == 0 or pose.name in held][:MAX_VIEWS]
+    selected = _thinned(poses, held)
     return {
         "up": _round_values(up),
         "target": _round_values(target),
@@ -151,6 +149,30 @@ def viewer_cameras(
             for pose in selected
         ],
     }
+
+
+def _thinned(poses: Sequence[PhotographPose], held: Collection[str]) -> list[PhotographPose]:
+    """Return at most ``MAX_VIEWS`` from all over the photographs, in their order.
+
+    Held-out ones are kept before others, as far as they leave half of the places for these.
+    """
+    if len(poses) <= MAX_VIEWS:
+        return list(poses)
+    is_held = [pose.name in held for pose in poses]
+    held_rows = [k for k, hold in enumerate(is_held) if hold]
+    other_rows = [k for k, hold in enumerate(is_held) if not hold]
+    held_count = min(len(held_rows), max(MAX_VIEWS // 2, MAX_VIEWS - len(other_rows)))
+    rows = _evenly(held_rows, held_count) + _evenly(other_rows, MAX_VIEWS - held_count)
+    return [poses[k] for k in sorted(rows)]
+
+
+def _evenly(rows: list[int], count: int) -> list[int]:
+    """Return ``count`` of the rows, or all where there are fewer.
+
+    >>> _evenly([0, 1, 2, 3, 4, 5], 3)
+    [0, 2, 4]
+    """
+    return rows if len(rows) <= count else [rows[k * len(rows) // count] for k in range(count)]
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ import json
 import struct
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -92,6 +93,20 @@ def test_viewer_cameras_thin_views_and_keep_held_out() -> None:
     views = viewer_cameras(poses, ["00001"])["views"]
     assert len(views) <= MAX_VIEWS
     assert [view["name"] for view in views if view["held_out"]] == ["00001"]
+
+
+@pytest.mark.parametrize("every", [0, 8, 7, 2])
+@pytest.mark.parametrize("count", [401, 1000, 3001])
+def test_viewer_cameras_come_from_all_over_many_photographs(count: int, every: int) -> None:
+    poses = [PhotographPose(f"{k:05}", np.eye(3), np.zeros(3), 50.0, 1.5) for k in range(count)]
+    held = [pose.name for k, pose in enumerate(poses) if every and k % every == 3 % every]
+    views: Any = viewer_cameras(poses, held)["views"]
+    names = [int(view["name"]) for view in views]
+    assert len(names) == MAX_VIEWS and names == sorted(set(names))
+    gaps = np.diff([-1, *names, count])
+    assert gaps.max() <= 2.5 * count / MAX_VIEWS + 1
+    kept = sum(view["held_out"] for view in views)
+    assert kept >= min(len(held), MAX_VIEWS // 2)
 
 
 @pytest.mark.parametrize("cut", [0, 7, 20, 60, 300])
