@@ -42,7 +42,7 @@ class PhotographPose:
         rotation_cam_from_world: rows are the camera's right, down and forward in the world.
         centre_world: where it stood.
         fov_y_degrees: angle from top to bottom.
-        aspect: width over height.
+        aspect: width over height of what it shows, which is that of its pixels where these are square.
     """
 
     name: str
@@ -83,8 +83,8 @@ def read_view_poses(content: Mapping[str, Any]) -> list[PhotographPose]:
 
 def _pose_of_view(view: Mapping[str, Any], cameras: Sequence[Mapping[str, Any]]) -> PhotographPose | None:
     camera = cameras[view["camera"]]
-    fy = float(camera["params"][0 if camera["model"] in _SINGLE_FOCAL_NAMES else 1])
-    intrinsics = _intrinsics_from_focal(camera["width_px"], camera["height_px"], fy)
+    fx, fy = _focal_lengths(camera["params"], camera["model"] in _SINGLE_FOCAL_NAMES)
+    intrinsics = _intrinsics_from_focal(camera["width_px"], camera["height_px"], fx, fy)
     rotation = np.array(view["rotation_cam_from_world"], np.float64)
     translation = np.array(view["translation_cam_from_world"], np.float64)
     if intrinsics is None or not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
@@ -187,11 +187,17 @@ _ImageRecord = tuple[list[float], int, str]
 """Seven numbers of the pose, the camera's id, the name."""
 
 
-def _intrinsics_from_focal(width: float, height: float, fy: float) -> _Intrinsics | None:
+def _focal_lengths(parameters: Sequence[float], has_one: bool) -> tuple[float, float]:
+    """Return both focal lengths of a camera, the first of its parameters."""
+    return float(parameters[0]), float(parameters[0 if has_one else 1])
+
+
+def _intrinsics_from_focal(width: float, height: float, fx: float, fy: float) -> _Intrinsics | None:
     """Return the vertical field of view and the aspect; None where a number is not positive and finite."""
-    if not (width > 0 and height > 0 and fy > 0 and np.isfinite([width, height, fy]).all()):
+    numbers = np.array([width, height, fx, fy], np.float64)
+    if not ((numbers > 0).all() and np.isfinite(numbers).all()):
         return None
-    return _Intrinsics(float(np.degrees(2 * np.arctan(height / (2 * fy)))), width / height)
+    return _Intrinsics(float(np.degrees(2 * np.arctan(height / (2 * fy)))), width * fy / (height * fx))
 
 
 def _pose_of_image(record: _ImageRecord, intrinsics: dict[int, _Intrinsics]) -> PhotographPose | None:
@@ -222,8 +228,9 @@ def _read_cameras_bin(file: IO[bytes]) -> dict[int, _Intrinsics]:
         if model not in _PARAMETER_COUNTS:
             raise ValueError(f"unsupported COLMAP camera model {model}")
         parameters = _unpack(file, f"<{_PARAMETER_COUNTS[model]}d")
-        fy = parameters[0 if model in _SINGLE_FOCAL_MODELS else 1]  # after fx, where there are two
-        found = _intrinsics_from_focal(width, height, fy)
+        found = _intrinsics_from_focal(
+            width, height, *_focal_lengths(parameters, model in _SINGLE_FOCAL_MODELS)
+        )
         if found is not None:
             intrinsics[camera_id] = found
     return intrinsics
@@ -255,8 +262,8 @@ def _read_cameras_txt(file: IO[bytes]) -> dict[int, _Intrinsics]:
         if not words:
             continue
         parameters = [float(word) for word in words[4:]]
-        fy = parameters[0 if words[1] in _SINGLE_FOCAL_NAMES else 1]
-        found = _intrinsics_from_focal(float(words[2]), float(words[3]), fy)
+        focal_lengths = _focal_lengths(parameters, words[1] in _SINGLE_FOCAL_NAMES)
+        found = _intrinsics_from_focal(float(words[2]), float(words[3]), *focal_lengths)
         if found is not None:
             intrinsics[int(words[0])] = found
         _check_record_count(len(intrinsics))
