@@ -344,6 +344,7 @@ const steps = {
         await page.selectOption("#viewer .views", String(held - 1));
         found.place = await page.textContent("#viewer .place");
         await page.selectOption("#viewer .photo-mode", "over");
+        await page.waitForSelector("#viewer .photo:not([hidden])");
         found.photograph = await page.evaluate(async () => {
             const image = document.querySelector("#viewer .photo");
             await image.decode();

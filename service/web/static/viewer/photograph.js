@@ -8,10 +8,16 @@ export class Photograph {
         this.address = box.dataset.photographs;
         this.view = null;
         this.isAtView = false;
+        this.isThere = false; // the image that the element names has come
         box.querySelectorAll(".with-photographs").forEach((part) => { part.hidden ||= !this.address; });
         this.mode.addEventListener("change", () => this.show());
         this.share.addEventListener("input", () => { this.image.style.opacity = this.share.value / 100; });
+        this.image.addEventListener("load", () => {
+            this.isThere = true;
+            this.show();
+        });
         this.image.addEventListener("error", () => {
+            this.isThere = false;
             this.image.hidden = true;
             if (this.mode.value) place.textContent = "This browser cannot show the photograph.";
         });
@@ -34,10 +40,16 @@ export class Photograph {
     show() {
         const mode = this.mode.value, { image, view } = this;
         this.share.hidden = mode !== "over";
-        image.hidden = !view || !mode || (mode === "over" && !this.isAtView);
-        if (image.hidden) return;
+        if (!view || !mode || (mode === "over" && !this.isAtView)) {
+            image.hidden = true;
+            return;
+        }
         const address = `${this.address}images/${view.name.split("/").map(encodeURIComponent).join("/")}`;
-        if (image.getAttribute("src") !== address) image.src = address;
+        if (image.getAttribute("src") !== address) {
+            this.isThere = false;
+            image.src = address;
+        }
+        image.hidden = !this.isThere; // the one before would be shown until then
         image.alt = `Photograph ${view.name}`;
         image.classList.toggle("corner", mode === "corner");
         image.style.opacity = mode === "over" ? this.share.value / 100 : 1;
