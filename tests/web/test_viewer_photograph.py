@@ -77,3 +77,26 @@ def test_photograph_that_cannot_be_shown_stays_away(tmp_path: Path) -> None:
         tmp_path,
     )
     assert found == [True, True, False, "This browser cannot show the photograph."]
+
+
+@pytest.mark.parametrize("degrees", [0, 90, -35, 180])
+def test_photograph_of_a_turned_camera_lies_turned(degrees: int, tmp_path: Path) -> None:
+    """What was at the photograph's top is in its direction in the view, whose own up stays that of the scene."""
+    angle = np.radians(degrees)
+    found = in_page(
+        """
+        const camera = new PerspectiveCamera(40, 1, 0.1, 100);
+        camera.position.set(0, 0, 5);
+        camera.lookAt(0, 0, 0);
+        photograph.fit(camera);
+        choose("over");
+        photograph.goTo(view("a.png", { up: job.up }));
+        await after("load");
+        const turned = getComputedStyle(image).rotate;
+        choose("corner");
+        return [turned === "none" ? 0 : parseFloat(turned), getComputedStyle(image).rotate];
+        """,
+        tmp_path,
+        up=[float(np.sin(angle)), float(np.cos(angle)), 0.0],
+    )
+    assert found[0] == pytest.approx(degrees, abs=1e-3) and found[1] == "none"

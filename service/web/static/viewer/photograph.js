@@ -1,5 +1,7 @@
 // The photograph of the view that the camera is at: over the scene, as far as it covers it, or beside it in a corner.
 
+import { Vector3 } from "../vendor/three.js";
+
 export class Photograph {
     constructor(box, place) {
         this.image = box.querySelector(".photo");
@@ -63,6 +65,12 @@ export class Photograph {
         const tangent = (degrees) => Math.tan((degrees * Math.PI) / 360);
         const height = this.image.parentElement.clientHeight * (tangent(this.view.fov_y_degrees) / tangent(camera.fov));
         const isOver = this.mode.value === "over";
-        Object.assign(this.image.style, { height: isOver ? `${height}px` : "", width: isOver ? `${height * this.view.aspect}px` : "" });
+        Object.assign(this.image.style, { height: isOver ? `${height}px` : "", width: isOver ? `${height * this.view.aspect}px` : "", rotate: isOver ? `${rollOf(this.view, camera)}rad` : "" });
     }
+}
+
+/** By how much a photograph is turned clockwise as the viewer's camera sees it, which is always upright. */
+function rollOf({ up }, { quaternion }) {
+    const top = new Vector3().fromArray(up);
+    return Math.atan2(top.dot(new Vector3(1, 0, 0).applyQuaternion(quaternion)), top.dot(new Vector3(0, 1, 0).applyQuaternion(quaternion)));
 }
