@@ -43,6 +43,7 @@ class PhotographPose:
         centre_world: where it stood.
         fov_y_degrees: angle from top to bottom.
         aspect: width over height of what it shows, which is that of its pixels where these are square.
+        is_panorama: whether it shows all directions; angle and aspect are then those of its middle.
     """
 
     name: str
@@ -50,6 +51,7 @@ class PhotographPose:
     centre_world: Float64[np.ndarray, "3"]
     fov_y_degrees: float
     aspect: float
+    is_panorama: bool = False
 
 
 def read_poses(cameras: IO[bytes], images: IO[bytes], *, binary: bool) -> list[PhotographPose]:
@@ -83,15 +85,21 @@ def read_view_poses(content: Mapping[str, Any]) -> list[PhotographPose]:
 
 def _pose_of_view(view: Mapping[str, Any], cameras: Sequence[Mapping[str, Any]]) -> PhotographPose | None:
     camera = cameras[view["camera"]]
-    fx, fy = _focal_lengths(camera["params"], camera["model"] in _SINGLE_FOCAL_NAMES)
-    intrinsics = _intrinsics_from_focal(camera["width_px"], camera["height_px"], fx, fy)
+    is_panorama = camera["model"] == _PANORAMA
+    if is_panorama:
+        intrinsics: _Intrinsics | None = _PANORAMA_MIDDLE
+    else:
+        fx, fy = _focal_lengths(camera["params"], camera["model"] in _SINGLE_FOCAL_NAMES)
+        intrinsics = _intrinsics_from_focal(camera["width_px"], camera["height_px"], fx, fy)
     rotation = np.array(view["rotation_cam_from_world"], np.float64)
     translation = np.array(view["translation_cam_from_world"], np.float64)
     if intrinsics is None or not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
         return None
     # A point of the world is R p + t in the camera, so that the camera's own place is -R' t.
     centre = -rotation.T @ translation
-    return PhotographPose(str(view["name"]), rotation, centre, intrinsics.fov_y_degrees, intrinsics.aspect)
+    return PhotographPose(
+        str(view["name"]), rotation, centre, intrinsics.fov_y_degrees, intrinsics.aspect, is_panorama
+    )
 
 
 def viewer_cameras(
@@ -143,6 +151,7 @@ def viewer_cameras(
                 "up": _round_values(-pose.rotation_cam_from_world[1]),
                 "fov_y_degrees": round(pose.fov_y_degrees, 4),
                 "aspect": round(pose.aspect, 5),
+                "panorama": pose.is_panorama,
                 "held_out": pose.name in held,
                 "nearest_world": nearest_world.get(pose.name, 0.0),
             }
@@ -183,6 +192,9 @@ class _Intrinsics:
     aspect: float
 
 
+_PANORAMA = "EQUIRECTANGULAR"
+_PANORAMA_MIDDLE = _Intrinsics(60.0, 1.5)
+"""What the viewer shows of a panorama where it goes to its place."""
 _ImageRecord = tuple[list[float], int, str]
 """Seven numbers of the pose, the camera's id, the name."""
 

@@ -117,6 +117,20 @@ def test_gaussians_outside_of_all_photographs_are_left_out_and_the_heaviest_come
     assert found["one"] == [1]  # the heaviest
 
 
+def test_panoramas_show_what_is_behind_them() -> None:
+    """Four of six Gaussians are before no camera, but all of them are in each panorama."""
+    means = [(0, 0, 9), (0.1, 0, 9), (0, 0, -9), (9, 0, 0), (-9, 0, 0), (0, 9, 0)]
+    found = in_page(
+        """
+        const shown = (views) => Array.from(shownBy(6, new Float32Array(job.geometry), views));
+        return [shown(job.views.map((one) => ({ ...one, panorama: true }))), shown(job.views)];
+        """,
+        geometry=[value for mean in means for value in (*mean, 0.9, *[0] * 8)],
+        views=[view((0.1 * k, 0, 0), (0, 0, 1)) for k in range(4)] + [view((0, 0, 0), (1, 0, 0))] * 2,
+    )
+    assert found == [[1, 1, 1, 1, 1, 1], [1, 1, 0, 1, 0, 0]]
+
+
 @pytest.mark.parametrize("count", [40_000, 1_000_000])
 def test_frames_come_in_time_on_slow_and_fast_machines(count: int) -> None:
     """Frames of a renderer that takes a fixed time, so much a pixel and so much a Gaussian."""

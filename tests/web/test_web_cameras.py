@@ -155,8 +155,11 @@ def test_web_cameras_of_real_model_match_pycolmap(scenes_root: Path) -> None:
 class StoredViews:
     """A storage that holds the views of a run."""
 
+    def __init__(self, **camera: Any) -> None:
+        size = {"width_px": 400, "height_px": 300}
+        self.camera = {"model": "PINHOLE", "params": [300, 300, 200, 150], **size, **camera}
+
     def read(self, sha256: str) -> list[bytes]:
-        camera = {"model": "PINHOLE", "params": [300, 300, 200, 150], "width_px": 400, "height_px": 300}
         views = [
             {
                 "name": f"{k}.jpg",
@@ -167,7 +170,7 @@ class StoredViews:
             for k, (rotation, centre) in enumerate(zip(rotations(), CENTRES, strict=True))
         ]
         assert sha256 == "views"
-        return [json.dumps({"cameras": [camera], "views": views}).encode()]
+        return [json.dumps({"cameras": [self.camera], "views": views}).encode()]
 
 
 def test_cameras_of_a_job_on_a_transforms_file_are_those_of_its_result() -> None:
@@ -179,3 +182,14 @@ def test_cameras_of_a_job_on_a_transforms_file_are_those_of_its_result() -> None
     for k, centre in enumerate(CENTRES):
         np.testing.assert_allclose(places[f"{k}.jpg"], centre, atol=1e-4)
     assert viewer_cameras_of_job(service, [], files, None) == {"views": []}  # type: ignore[arg-type]
+
+
+def test_panoramas_are_told_from_photographs_with_edges() -> None:
+    row: Any = SimpleNamespace(name="views.json", sha256="views", size_bytes=1000)
+    kinds = []
+    for camera in ({}, {"model": "EQUIRECTANGULAR", "params": [400, 200], "height_px": 200}):
+        service: Any = SimpleNamespace(storage=StoredViews(**camera))
+        views: Any = viewer_cameras_of_job(service, [row], [], None)["views"]
+        kinds.append([view["panorama"] for view in views])
+        assert all(0 < view["fov_y_degrees"] < 90 and view["aspect"] > 0 for view in views)
+    assert kinds == [[False] * 4, [True] * 4]

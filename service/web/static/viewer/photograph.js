@@ -42,7 +42,8 @@ export class Photograph {
     show() {
         const mode = this.mode.value, { image, view } = this;
         this.share.hidden = mode !== "over";
-        if (!view || !mode || (mode === "over" && !this.isAtView)) {
+        // A panorama lies over no view.
+        if (!view || !mode || (mode === "over" && (!this.isAtView || view.panorama))) {
             image.hidden = true;
             return;
         }

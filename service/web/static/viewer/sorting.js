@@ -85,15 +85,16 @@ export function shownBy(count, geometry, views) {
     return hidden > MAX_HIDDEN_SHARE * count ? shown.fill(1) : shown;
 }
 
-/** The image of a view as of cameras.json, `margin` times as large. */
-export function frameOfView({ position, forward, up, fov_y_degrees: fovY, aspect }, margin) {
+/** The image of a view as of cameras.json, `margin` times as large; a panorama shows everything. */
+export function frameOfView({ position, forward, up, fov_y_degrees: fovY, aspect, panorama = false }, margin) {
     const right = [forward[1] * up[2] - forward[2] * up[1], forward[2] * up[0] - forward[0] * up[2], forward[0] * up[1] - forward[1] * up[0]];
     const tangent = Math.tan((fovY * Math.PI) / 360) * margin;
-    return { position, forward, up, right, y: tangent, x: tangent * aspect };
+    return { position, forward, up, right, y: tangent, x: tangent * aspect, panorama };
 }
 
 /** Whether a point lies in such an image. */
-export function isInFrame({ position: p, forward: f, up: u, right: r, x, y }, a, b, c) {
+export function isInFrame({ position: p, forward: f, up: u, right: r, x, y, panorama }, a, b, c) {
+    if (panorama) return true;
     const dx = a - p[0], dy = b - p[1], dz = c - p[2];
     const depth = dx * f[0] + dy * f[1] + dz * f[2];
     return depth > 0 && Math.abs(dx * r[0] + dy * r[1] + dz * r[2]) < x * depth && Math.abs(dx * u[0] + dy * u[1] + dz * u[2]) < y * depth;
