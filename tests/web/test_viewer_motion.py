@@ -117,6 +117,29 @@ def test_gaussians_outside_of_all_photographs_are_left_out_and_the_heaviest_come
     assert found["one"] == [1]  # the heaviest
 
 
+@pytest.mark.parametrize("overlap", [3, 9, 16, 25])
+def test_nothing_that_photographs_show_is_left_out_of_a_large_scene(overlap: int) -> None:
+    """A field from above in 20 x 20 photographs, each point in ``overlap`` of them; and streaks far away."""
+    side, height = 20, 10.0
+    angle = 2 * np.degrees(np.arctan(np.sqrt(overlap) / 2 / height))
+    places = [(x, y) for y in range(side) for x in range(side)]
+    views = [
+        {**view((x, y, height), (0, 0, -1)), "up": (0, 1, 0), "fov_y_degrees": angle} for x, y in places
+    ]
+    random = np.random.default_rng(4)
+    field = np.pad(random.uniform(2.5, side - 3.5, (300, 2)), ((0, 0), (0, 1)))
+    streaks = random.uniform(200, 300, (60, 3))
+    geometry = np.pad(np.concatenate([field, streaks]), ((0, 0), (0, 9)))
+    found = in_page(
+        "return Array.from(shownBy(360, new Float32Array(job.geometry), job.views));",
+        geometry=geometry.ravel().tolist(),
+        views=views,
+    )
+    assert found[:300] == [1] * 300
+    # Where hardly any photograph shows what, streaks are not told from the field.
+    assert found[300:] == [1 if overlap == 3 else 0] * 60
+
+
 def test_panoramas_show_what_is_behind_them() -> None:
     """Four of six Gaussians are before no camera, but all of them are in each panorama."""
     means = [(0, 0, 9), (0.1, 0, 9), (0, 0, -9), (9, 0, 0), (-9, 0, 0), (0, 9, 0)]
