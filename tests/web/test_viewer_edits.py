@@ -27,6 +27,7 @@ PAGE = """<!doctype html>
 <html><body><script type="module">
 import { PerspectiveCamera, Vector3 } from "/files/vendor/three.js";
 import { removedBy } from "/files/viewer/cleaning.js";
+import { toHalf } from "/files/viewer/half.js";
 import { makeTree } from "/files/viewer/nearest.js";
 import { pick } from "/files/viewer/picking.js";
 import { readGaussians } from "/files/viewer/ply.js";
@@ -206,3 +207,15 @@ def test_nearest_neighbors_are_those_of_a_full_search() -> None:
     distances = np.linalg.norm(points[:, None] - points[None], axis=2)
     np.fill_diagonal(distances, np.inf)
     np.testing.assert_allclose(found, np.sort(distances, axis=1)[:, :7], atol=1e-12)
+
+
+def test_half_precision_numbers_are_the_nearest() -> None:
+    values = [0.0, 6e-8, 3e-5, 0.1, -1.7, 1000.3, 32767.0, 32768.0, 40000.0, -50010.0, 65504.0, 65519.0]
+    beyond = [65520.0, 1e6, float("inf")]
+    found = in_page(
+        "return [...job.values, ...job.beyond.map(Number)].map(toHalf);",
+        values=values,
+        beyond=[str(value).replace("inf", "Infinity") for value in beyond],
+    )
+    shown = np.uint16(found).view(np.float16)
+    np.testing.assert_array_equal(shown, np.float16([*values, *[65504.0] * len(beyond)]))
