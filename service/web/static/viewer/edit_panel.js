@@ -53,7 +53,7 @@ export class EditPanel {
     showNumbers() {
         for (const output of this.form.querySelectorAll("output")) {
             const input = document.getElementById(output.htmlFor.value), axis = "xyz".indexOf(input.name[0]);
-            output.textContent = (Number(input.value) + this.origin[axis]).toPrecision(4);
+            output.textContent = (Number(input.value) + this.origin[axis]).toFixed(decimalsOf(Number(input.step)));
         }
     }
 
@@ -79,7 +79,7 @@ export class EditPanel {
         const region = this.form.querySelector("#edit-region"); // not there for results of other jobs
         if (region) {
             region.hidden = !box;
-            if (box) region.href = `${region.dataset.new}#region=${this.inFile(box).map((value) => value.toPrecision(5)).join(",")}`;
+            if (box) region.href = `${region.dataset.new}#region=${this.inText(box).join(",")}`;
         }
         this.viewer.overlay.box = box;
         this.showNumbers();
@@ -99,6 +99,12 @@ export class EditPanel {
         return box.map((value, k) => value + this.origin[k % 3]);
     }
 
+    /** The same as text, each number as fine as its slider moves, however far the scene is from the origin. */
+    inText(box) {
+        const step = (k) => Number(this.form.elements[`${"xyz"[k % 3]}_low`].step);
+        return this.inFile(box).map((value, k) => value.toFixed(decimalsOf(step(k) / 10)));
+    }
+
     tell({ counts, kept }) {
         const reasons = Object.entries(counts).filter(([, number]) => number).map(([reason, number]) => `${thousands(number)} ${WORDS[reason]}`);
         this.state.textContent = `${thousands(kept)} Gaussians stay${reasons.length ? `; ${reasons.join(", ")}` : ""}.`;
@@ -116,4 +122,9 @@ export class EditPanel {
             fault.hidden = false;
         }
     }
+}
+
+/** Digits behind the point that tell one step of a slider from the next. */
+function decimalsOf(step) {
+    return Math.min(20, Math.max(0, Math.ceil(-Math.log10(step))));
 }
