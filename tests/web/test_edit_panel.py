@@ -75,3 +75,23 @@ def test_box_of_a_scene_far_from_the_origin_is_as_fine_as_any(origin: list[float
     x_low, *others = found["box"]
     np.testing.assert_allclose(found["link"][1:], others, atol=1e-3)
     assert len(set(found["texts"])) == 3 and float(found["texts"][0]) == pytest.approx(x_low, abs=0.04)
+
+
+def test_what_is_wrong_is_told_and_hinders_nothing_else() -> None:
+    found = in_panel(
+        """
+        document.getElementById("edit").open = true;
+        fill("crop", true);
+        fill("clean", true);
+        fill("min_group", "1");
+        await pause(300);
+        const said = panel.state.textContent, edited = edits.length;
+        fill("clean", false);
+        form.querySelector("[value=crop]").click();
+        await pause(300);
+        return { said, edited, later: edits.length, asked, fault: form.querySelector(".fault").textContent };
+        """,
+        [0.0, 0.0, 0.0],
+    )
+    assert found["said"].startswith("Groups smaller than: ") and found["later"] > found["edited"]
+    assert [body["kind"] for body in found["asked"]] == ["crop"] and found["fault"] == "not now"

@@ -74,6 +74,8 @@ export class EditPanel {
         const { box, clean } = this.wanted();
         this.form.querySelector(".box-sliders").hidden = !box;
         this.form.querySelector(".clean-fields").hidden = !clean;
+        // What is not asked for keeps nothing from being asked for, whatever it says.
+        this.form.querySelectorAll(".clean-fields input").forEach((field) => { field.disabled = !clean; });
         this.form.querySelector("[value=crop]").disabled = !box;
         this.form.querySelector("[value=clean]").disabled = !clean;
         const region = this.form.querySelector("#edit-region"); // not there for results of other jobs
@@ -89,7 +91,11 @@ export class EditPanel {
     ask() {
         const { box, clean } = this.wanted(), isOpen = this.panel.open && (box || clean);
         this.viewer.overlay.box = isOpen ? box : null;
-        if (isOpen && !this.form.checkValidity()) return;
+        const wrong = isOpen && this.form.querySelector("input:invalid");
+        if (wrong) {
+            this.state.textContent = `${wrong.labels[0].textContent}: ${wrong.validationMessage}`;
+            return;
+        }
         if (isOpen) this.state.textContent = "Looking …";
         this.viewer.edit(isOpen ? { box, clean } : { box: null, clean: null }, isOpen ? this.show : "all");
     }
