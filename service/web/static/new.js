@@ -158,8 +158,15 @@ pause.addEventListener("click", () => {
 
 addEventListener("beforeunload", (event) => { if (upload) event.preventDefault(); });
 
+/** What a job is asked for besides its photographs. */
+function askedFor() {
+    const asked = { kind, options: readOptions(form), queue: find("queue")?.value ?? "cpu" };
+    if (find("begin-with")?.checked) asked.source_id = find("begin-with").value;
+    return asked;
+}
+
 /** Sends a scene, or takes the dataset that is chosen, and queues its job; returns that. */
-async function startOne(scene, label, isOneOfMany) {
+async function startOne(scene, asked, label, isOneOfMany) {
     let id = known?.value;
     if (scene) {
         paces.length = 0;
@@ -167,8 +174,7 @@ async function startOne(scene, label, isOneOfMany) {
         pause.hidden = false;
         id = (await upload.run()).id;
     }
-    const body = { kind, dataset_id: id, options: readOptions(form), queue: find("queue")?.value ?? "cpu" };
-    if (find("begin-with")?.checked) body.source_id = find("begin-with").value;
+    const body = { ...asked, dataset_id: id };
     if (label) body.label = isOneOfMany ? shortName(`${label}: ${scene.title}`) : label;
     return queueJob(body, `page-${id}-${Date.now()}`);
 }
@@ -182,9 +188,10 @@ form.addEventListener("submit", async (event) => {
     }
     start.disabled = true;
     try {
-        const label = find("label").value.trim();
+        // Before anything is sent: what is wrong with it is told at once, and all of several jobs are asked for alike.
+        const asked = askedFor(), label = find("label").value.trim();
         const queued = [];
-        for (const scene of scenes ?? [null]) queued.push(await startOne(scene, label, scenes?.length > 1));
+        for (const scene of scenes ?? [null]) queued.push(await startOne(scene, asked, label, scenes?.length > 1));
         upload = null;
         location.href = queued.length > 1 ? "/" : `/jobs/${queued[0]}`;
     } catch (error) {

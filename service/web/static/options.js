@@ -24,9 +24,17 @@ function valueOf(field) {
     if (field.dataset.type === "number") return Number(text);
     if (field.dataset.type === "yes_no") return text === "true";
     if (field.dataset.type === "numbers") return text.split(/[\s,]+/).map(Number);
-    if (field.dataset.type === "json") return JSON.parse(text);
+    if (field.dataset.type === "json") return jsonOf(text, field);
     if (field.dataset.type === "list") return text.split(",").map((part) => part.trim()).filter(Boolean);
     return text;
+}
+
+function jsonOf(text, field) {
+    try {
+        return JSON.parse(text);
+    } catch {
+        throw new Error(`${field.labels?.[0]?.textContent ?? field.dataset.path}: this is not JSON.`);
+    }
 }
 
 /** The names by which options know the files of a field; undefined where none was chosen. */

@@ -1,0 +1,84 @@
+"""The page of a new job by itself: what it asks the service for, and when."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import octasplat.service.web as service_web
+from tests.support.browser import open_page
+
+pytestmark = [pytest.mark.tools, pytest.mark.heavy]
+
+STATIC = Path(service_web.__file__).parent / "static"
+PAGE = """<!doctype html>
+<html><body>
+<form id="new-job" data-kind="reconstruct" data-given='GIVEN'>
+<div id="drop"><button type="button" data-pick="pick-folder">Folder</button><input type="file" id="pick-folder" multiple>
+<button type="button" data-pick="pick-files">Files</button><input type="file" id="pick-files" multiple></div>
+<div id="chosen" hidden><p id="chosen-text" tabindex="-1"></p><button type="button" id="forget">Others</button>
+<ul id="chosen-notes"></ul></div>
+<select id="dataset"><option value=""><option value="known"></select>
+<fieldset data-path="preset" data-type="radio" data-default="standard"><input type="radio" name="preset" value="standard" checked></fieldset>
+<label for="label">Name</label><input id="label">
+<label for="steps">Steps</label><input id="steps" type="number" data-path="train.iterations" data-type="number" data-default="">
+<label for="odd">Odd</label><input id="odd" data-path="train.odd" data-type="json" data-default="">
+<fieldset data-path="exports" data-type="files"><legend>Files</legend>
+<label class="check"><input type="checkbox" value="viewer.glb" checked></label>
+<label class="check"><input type="checkbox" value="scene.spz"></label></fieldset>
+<section id="going" hidden><progress id="going-bar"></progress><p id="going-text"></p></section>
+<p id="estimate" hidden></p><div id="faults" tabindex="-1" hidden></div>
+<button id="start" type="submit">Start</button><button type="button" id="pause" hidden>Pause</button>
+</form>
+<script type="module">
+const pause = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
+const find = (id) => document.getElementById(id);
+const asked = []; // [method, path, body]
+let answers = {}; // by method and path
+window.fetch = async (address, { method = "GET", body } = {}) => {
+    const path = String(address).split("?")[0], sent = typeof body === "string" ? JSON.parse(body) : null;
+    asked.push([method, path, sent]);
+    const answer = answers[`${method} ${path}`];
+    const { content = {}, status = 200 } = answer ? await answer(sent) : { status: 404 };
+    return new Response(JSON.stringify(content), { status });
+};
+answers["POST /v1/scene-previews"] = ({ files }) => ({ content: {
+    files: files.map(({ path, size_bytes }) => ({ name: `images/${path}`, path, size_bytes })), folder: "", notes: [],
+    refusals: files.length ? [] : [{ detail: "There are no photographs." }], photographs: files.length, has_poses: false,
+} });
+const choose = (...names) => {
+    const transfer = new DataTransfer();
+    names.forEach((name) => transfer.items.add(new File(["x"], name)));
+    find("pick-files").files = transfer.files;
+    find("pick-files").dispatchEvent(new Event("change"));
+};
+await import("/files/new.js");
+window.result = (async () => { BODY })();
+</script></body></html>
+"""
+
+
+def in_page(body: str, given: dict[str, Any] | None = None) -> Any:
+    files = {path.relative_to(STATIC).as_posix(): path for path in STATIC.rglob("*.js")}
+    page = open_page(PAGE.replace("GIVEN", json.dumps(given or {})).replace("BODY", body), files=files)
+    assert page.result is not None, page.messages
+    return page.result
+
+
+def test_wrong_settings_are_told_before_anything_is_sent() -> None:
+    found = in_page(
+        """
+        choose("a.jpg");
+        await pause(100);
+        find("odd").value = "{";
+        find("odd").dispatchEvent(new Event("input", { bubbles: true }));
+        await pause(600);
+        const estimate = find("estimate").textContent;
+        find("start").click();
+        await pause(300);
+        return { estimate, faults: find("faults").textContent, asked: asked.map(([, path]) => path) };
+        """
+    )
+    assert found["estimate"] == found["faults"] == "Odd: this is not JSON."
+    assert found["asked"] == ["/v1/scene-previews"]
