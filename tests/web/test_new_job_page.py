@@ -82,3 +82,59 @@ def test_wrong_settings_are_told_before_anything_is_sent() -> None:
     )
     assert found["estimate"] == found["faults"] == "Odd: this is not JSON."
     assert found["asked"] == ["/v1/scene-previews"]
+
+
+def test_nothing_else_is_begun_while_photographs_are_sent() -> None:
+    found = in_page(
+        """
+        choose("a.jpg");
+        await pause(100);
+        answers["POST /v1/datasets"] = () => new Promise(() => {});
+        find("start").click();
+        await pause(100);
+        find("forget").click();
+        choose("b.jpg");
+        await pause(100);
+        find("start").click();
+        await pause(100);
+        return { text: find("chosen-text").textContent, asked: asked.filter(([, path]) => path === "/v1/datasets").length };
+        """
+    )
+    assert "1 photographs" in found["text"] and found["asked"] == 1
+
+
+def test_late_drop_does_not_replace_what_was_chosen_since_and_broken_ones_are_told() -> None:
+    found = in_page(
+        """
+        const dropped = (getFile) => {
+            const entry = { name: "dropped.jpg", isFile: true, file: getFile };
+            const event = new Event("drop", { bubbles: true, cancelable: true });
+            event.dataTransfer = { types: ["Files"], items: [{ webkitGetAsEntry: () => entry }], files: [] };
+            document.dispatchEvent(event);
+        };
+        dropped((resolve) => setTimeout(() => resolve(new File(["xyz"], "dropped.jpg")), 300));
+        await pause(50);
+        choose("a.jpg", "b.jpg");
+        await pause(600);
+        const texts = [find("chosen-text").textContent];
+        dropped((_resolve, reject) => reject(new DOMException("It cannot be read.", "NotReadableError")));
+        await pause(200);
+        return [...texts, find("faults").textContent];
+        """
+    )
+    assert found == ["2 photographs, 2 B", "It cannot be read."]
+
+
+def test_word_that_is_dropped_on_a_field_leaves_the_photographs() -> None:
+    found = in_page(
+        """
+        choose("a.jpg");
+        await pause(100);
+        const event = new DragEvent("drop", { bubbles: true, cancelable: true, dataTransfer: new DataTransfer() });
+        event.dataTransfer.setData("text/plain", "a name");
+        find("label").dispatchEvent(event);
+        await pause(200);
+        return { stopped: event.defaultPrevented, chosen: !find("chosen").hidden, faults: find("faults").textContent };
+        """
+    )
+    assert found == {"stopped": False, "chosen": True, "faults": ""}
