@@ -138,3 +138,16 @@ def test_word_that_is_dropped_on_a_field_leaves_the_photographs() -> None:
         """
     )
     assert found == {"stopped": False, "chosen": True, "faults": ""}
+
+
+def test_files_of_another_job_are_asked_for_whatever_they_are_called() -> None:
+    found = in_page(
+        """
+        const { readOptions } = await import("/files/options.js");
+        const before = readOptions(find("new-job")).exports;
+        document.querySelector("[value='<b>.glb']").click();
+        return [before, readOptions(find("new-job")).exports];
+        """,
+        {"exports": ["scene.spz", "other.glb", "<b>.glb"]},
+    )
+    assert found == [["scene.spz", "other.glb", "<b>.glb"], ["scene.spz", "other.glb"]]

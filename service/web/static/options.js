@@ -77,7 +77,9 @@ export function fillOptions(form, given) {
         const value = valueAt(field.dataset.path);
         if (value === undefined || value === null || field === preset || field.dataset.type.startsWith("upload")) continue;
         if (field.dataset.type === "files") {
-            for (const box of field.querySelectorAll("input")) box.checked = value.includes(box.value) && !box.disabled;
+            const boxes = [...field.querySelectorAll("input")];
+            for (const box of boxes) box.checked = value.includes(box.value) && !box.disabled;
+            field.append(...value.filter((name) => !boxes.some((box) => box.value === name)).map(boxFor));
             continue;
         }
         const defaults = field.dataset.defaults ? JSON.parse(field.dataset.defaults) : {};
@@ -86,6 +88,15 @@ export function fillOptions(form, given) {
         const shown = field.dataset.type === "yes_no" ? (value ? "yes" : "no") : text;
         if (shown !== String(usual) && text !== "") field.value = text;
     }
+}
+
+/** A box for a file that the form does not offer by itself: formats can have other names. */
+function boxFor(name) {
+    const label = Object.assign(document.createElement("label"), { className: "check" });
+    const span = document.createElement("span");
+    span.append(Object.assign(document.createElement("b"), { textContent: name }));
+    label.append(Object.assign(document.createElement("input"), { type: "checkbox", value: name, checked: true }), span);
+    return label;
 }
 
 function textOf(type, value) {
