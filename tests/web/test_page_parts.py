@@ -122,6 +122,18 @@ async def test_names_of_users_are_text(connect_service: ConnectService, database
             assert HOSTILE not in text and "&#34;&gt;&lt;img" in text
 
 
+async def test_job_that_is_run_again_keeps_its_queue(
+    connect_service: ConnectService, database: str
+) -> None:
+    async with connect_service() as (http, _):
+        job = await make_job(database, queue="night")
+        page = (await http.get("/new", params={"like": str(job)})).text
+        queues = re.search(r'<select id="queue">(.*?)</select>', page)
+        assert queues is not None
+        options = re.findall(r'<option value="(\w+)"( selected)?>', queues[1])
+        assert options == [("cpu", ""), ("night", " selected")]
+
+
 async def test_job_list_shows_own_jobs_only(connect_service: ConnectService, database: str) -> None:
     async with connect_service(signed_in=False) as (http, _):
         job = await make_job(database, owner="ann", label="of ann")
