@@ -45,3 +45,96 @@ def test_wrong_field_is_shown_wherever_it_is_folded_away() -> None:
         "<details><summary>others</summary><input></details><button>Start</button></form>",
     )
     assert found == {"folds": [True, True, False], "active": "wrong"}
+
+
+UPLOAD = """
+const { Upload } = await import("/files/upload.js");
+const deleted = [];
+window.fetch = async (address, { method }) => {
+    deleted.push(`${method} ${address}`);
+    const status = job.statuses[Math.min(deleted.length, job.statuses.length) - 1];
+    return status === 204 ? new Response(null, { status }) : json({ detail: "not now" }, status);
+};
+const upload = new Upload({ files: [], bytes: 0 }, "title", () => {});
+const error = await upload.removeOthers("d", new Map([["images/a.jpg", {}], ["images/old b.jpg", {}]]), [{ name: "images/a.jpg" }])
+    .then(() => null, ({ message }) => message);
+return { error, deleted };
+"""
+
+
+@pytest.mark.parametrize(
+    ("statuses", "error", "tries"),
+    [([204], None, 1), ([404], None, 1), ([503, 204], None, 2), ([409], "not now", 1)],
+)
+def test_photographs_of_before_are_removed_or_it_is_told(
+    statuses: list[int], error: str | None, tries: int
+) -> None:
+    found = in_page(UPLOAD, statuses=statuses)
+    assert found == {"error": error, "deleted": ["DELETE /v1/datasets/d/files/images/old%20b.jpg"] * tries}
+
+
+TRIALS = """
+const { Trials } = await import("/files/trial.js");
+const section = document.querySelector("section"), trials = new Trials(section);
+const late = {}, gone = [];
+window.fetch = async (address, { method }) => {
+    const [id, ...rest] = String(address).replace("/v1/jobs/", "").split(/[/?]/);
+    if (method === "DELETE") {
+        gone.push(id);
+        return json({}, gone.length === 1 ? 503 : 200);
+    }
+    if (!rest.length) return json({ state: "succeeded", notes: [] });
+    if (rest.length === 1) return json({ artifacts: job.artifacts });
+    if (late[id]) await pause(late[id]);
+    return job.status === 200 ? new Response(new Blob([id])) : json({ detail: "It is gone." }, job.status);
+};
+const shown = async () => {
+    const { src, alt } = section.querySelector("img");
+    return src ? [await new Promise((resolve) => {
+        const request = new XMLHttpRequest();
+        request.onload = () => resolve(request.responseText);
+        request.open("GET", src);
+        request.send();
+    }), alt] : null;
+};
+const show = (name) => trials.show(async () => name, name, "so", "about it");
+"""
+SECTION = (
+    '<section><figure class="preview" hidden><img><figcaption></figcaption></figure>'
+    '<p class="light-state"></p><p class="fault" hidden></p></section>'
+)
+PICTURE = [{"name": "views/a.png"}]
+
+
+def test_late_preview_does_not_replace_a_newer_one() -> None:
+    found = in_page(
+        TRIALS
+        + """
+        late.first = 600;
+        const first = show("first");
+        await pause(100);
+        await show("second");
+        await first;
+        await pause(2600); // what is deleted is tried again after two seconds
+        return { shown: await shown(), gone: gone.sort() };
+        """,
+        SECTION,
+        artifacts=PICTURE,
+        status=200,
+    )
+    assert found["shown"] == ["second", "Preview of second so"]
+    assert found["gone"] in (["first", "second", "second"], ["first", "first", "second"])
+
+
+@pytest.mark.parametrize(
+    ("artifacts", "status", "words"),
+    [(PICTURE, 404, "It is gone."), ([{"name": "log.txt"}], 200, "The preview made no picture.")],
+)
+def test_preview_without_a_picture_is_told(artifacts: list[dict[str, str]], status: int, words: str) -> None:
+    found = in_page(
+        TRIALS + 'await show("a"); return [await shown(), section.querySelector(".fault").textContent];',
+        SECTION,
+        artifacts=artifacts,
+        status=status,
+    )
+    assert found == [None, words]
