@@ -15,9 +15,10 @@ pytestmark = [pytest.mark.tools, pytest.mark.heavy]
 STATIC = Path(service_web.__file__).parent / "static"
 PAGE = """<!doctype html>
 <html><body><script type="module">
-import { Vector3 } from "/files/vendor/three.js";
+import { PerspectiveCamera, Vector3 } from "/files/vendor/three.js";
 import { Limits } from "/files/viewer/limits.js";
 import { Pacing } from "/files/viewer/pacing.js";
+import { Walking } from "/files/viewer/walking.js";
 import { makeSorter, shownBy } from "/files/viewer/sorting.js";
 const job = JOB;
 window.result = (() => { BODY })();
@@ -115,6 +116,43 @@ def test_gaussians_outside_of_all_photographs_are_left_out_and_the_heaviest_come
     assert found["shown"] == [1, 1, 0, 0] and found["free"] == [1, 1, 1, 1]
     assert found["all"] == [1, 0]  # the farthest first
     assert found["one"] == [1]  # the heaviest
+
+
+KEYS = [
+    ("m", "KeyM", "measure"),
+    ("M", "KeyM", "measure"),
+    ("m", "Semicolon", "measure"),  # of a French keyboard
+    ("\u0442", "KeyN", "next"),  # of a Russian one
+    ("l", "KeyN", None),  # of a Dvorak keyboard, whose N lies elsewhere
+    ("+", "BracketRight", "nearer"),  # of a German keyboard
+    ("-", "Slash", "farther"),
+    ("=", "Equal", "nearer"),
+    ("-", "Minus", "farther"),
+    ("z", "KeyW", "nearer"),  # as W lies
+    ("x", "KeyX", None),
+]
+"""What is on a key, its place, and what it does."""
+
+
+def test_keys_do_what_is_on_them() -> None:
+    found = in_page(
+        """
+        return job.keys.map(([key, code]) => {
+            const canvas = document.createElement("canvas"), camera = new PerspectiveCamera(50, 1, 0.1, 100), done = [];
+            camera.position.set(0, 0, 5);
+            const controls = { target: new Vector3() };
+            const walking = new Walking(canvas, camera, controls, 1, (action) => done.push(action), () => {});
+            canvas.dispatchEvent(new KeyboardEvent("keydown", { key, code }));
+            walking.step(0.05);
+            canvas.dispatchEvent(new KeyboardEvent("keyup", { key: "*", code })); // with Shift pressed meanwhile
+            const { z } = camera.position;
+            walking.step(0.05);
+            return [done[0] ?? (z < 5 ? "nearer" : z > 5 ? "farther" : null), camera.position.z === z];
+        });
+        """,
+        keys=[key[:2] for key in KEYS],
+    )
+    assert found == [[does, True] for _, _, does in KEYS]
 
 
 @pytest.mark.parametrize("overlap", [3, 9, 16, 25])
