@@ -188,12 +188,14 @@ def test_what_is_not_drawn_is_not_picked(tmp_path: Path) -> None:
 
 def test_links_keep_a_view_and_nothing_else_is_taken_for_one() -> None:
     found = in_page(
-        "const link = linkOf([1.25, -2, 1e-7], [0, 3.5, -40000], 51.5);"
-        "return { link, view: viewOf(link), others: job.others.map(viewOf) };",
-        others=["", "#h-view", "#view=1,2,3", "#view=1,2,3,4,5,6,x", "#view=1,2,3,4,5,6,1e999"],
+        "const link = linkOf([1.25, -2, 1e-7], [0, 3.5, -40000], 51.5, 0.75);"
+        "return { link, view: viewOf(link), older: viewOf('#view=1,2,3,4,5,6,50'), others: job.others.map(viewOf) };",
+        others=["", "#h-view", "#view=1,2,3", "#view=1,2,3,4,5,6,x", "#view=1,2,3,4,5,6,1e999", "#view=1,2,3,4,5,6,7,8,9"],
     )
-    assert found["view"] == {"position": [1.25, -2, 1e-7], "target": [0, 3.5, -40000], "fovY": 51.5}
-    assert found["others"] == [None] * 5
+    expected = {"position": [1.25, -2, 1e-7], "target": [0, 3.5, -40000], "fovY": 51.5, "aspect": 0.75}
+    assert found["view"] == expected
+    assert found["older"] == {"position": [1, 2, 3], "target": [4, 5, 6], "fovY": 50}
+    assert found["others"] == [None] * 6
 
 
 def test_nearest_neighbors_are_those_of_a_full_search() -> None:

@@ -53,7 +53,7 @@ class Viewer extends LoadingViewer {
         this.say("Loading the scene");
         this.isLoading = true;
         try {
-            this.splats = new SplatRenderer(this.canvas);
+            this.splats ??= new SplatRenderer(this.canvas); // another scene may have failed before
         } catch {
             this.fail(new Error("This browser has no WebGL 2, so the scene cannot be shown here; the downloads open elsewhere."));
             return;
@@ -75,13 +75,19 @@ class Viewer extends LoadingViewer {
         const worker = new Worker(new URL("./scene_worker.js", import.meta.url), { type: "module" });
         worker.addEventListener("message", ({ data }) => this.hear(data));
         return new Promise((resolve, reject) => {
-            worker.onerror = () => reject(new Error("The scene cannot be loaded."));
+            const give = (error) => {
+                worker.terminate(); // and what it has loaded so far
+                reject(error);
+            };
+            worker.onerror = () => give(new Error("The scene cannot be loaded."));
             worker.onmessage = ({ data }) => {
                 if (data.scene) {
                     this.worker?.terminate();
                     this.worker = worker;
+                    this.picks.forEach((found) => found(null)); // which nobody answers any more
+                    this.picks.clear();
                     resolve(data.scene);
-                } else if (data.error) reject(new Error(data.error));
+                } else if (data.error) give(new Error(data.error));
                 else if (data.total) {
                     bar.max = data.total;
                     bar.value = data.loaded;
@@ -142,7 +148,7 @@ class Viewer extends LoadingViewer {
     endLoading(loaded) {
         this.isLoading = false;
         const { scene, count } = this.box.dataset;
-        if (this.frame && scene !== loaded) this.renew({ scene, count });
+        if (scene !== loaded) this.renew({ scene, count }); // also where the one before could not be shown
     }
 
     async loadCameras() {
@@ -219,11 +225,11 @@ class Viewer extends LoadingViewer {
     /** Goes to the view that the address names. */
     followLink() {
         const view = viewOf(location.hash);
-        if (view) this.goTo(view.position, new Vector3().fromArray(view.target), view.fovY);
+        if (view) this.goTo(view.position, new Vector3().fromArray(view.target), view.fovY, view.aspect);
     }
 
     async copyLink() {
-        const hash = linkOf(this.camera.position.toArray(), this.controls.target.toArray(), this.fovY);
+        const hash = linkOf(this.camera.position.toArray(), this.controls.target.toArray(), this.fovY, this.aspect);
         history.replaceState(null, "", hash);
         try {
             await navigator.clipboard.writeText(location.href);
@@ -233,10 +239,10 @@ class Viewer extends LoadingViewer {
         }
     }
 
-    goTo(position, target, fovY = this.fovY) {
+    goTo(position, target, fovY = this.fovY, aspect = this.aspect) {
         this.do("orbit");
         this.view = -1;
-        this.lookFrom(position, target, fovY, this.aspect ?? 1);
+        this.lookFrom(position, target, fovY, aspect);
         this.photograph.leave();
         this.wake();
     }
@@ -295,7 +301,7 @@ class Viewer extends LoadingViewer {
 
     stepView(step) {
         const count = this.frame.views.length;
-        if (count) this.showView((this.view + step + count) % count);
+        if (count) this.showView(this.view < 0 ? (step > 0 ? 0 : count - 1) : (this.view + step + count) % count);
     }
 
     showView(index) {

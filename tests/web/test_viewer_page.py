@@ -1,0 +1,137 @@
+"""The page of the 3D view as a whole, with a scene and cameras that are given to it, in headless Chromium."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import octasplat.service.web as service_web
+from octasplat.engine.files.gaussian_ply import write_gaussian_ply
+from octasplat.service.web.templating import render_template
+from tests.support.browser import open_page
+from tests.support.shell_scene import shell_scene
+
+pytestmark = [pytest.mark.tools, pytest.mark.heavy]
+
+STATIC = Path(service_web.__file__).parent / "static"
+STYLE = """<style>
+.screen { position: relative; height: 300px } canvas { display: block; width: 100%; height: 100% }
+.overlay { position: absolute; inset: 0 }
+</style>"""
+SCRIPT = """<script type="module">
+import { viewOf } from "/files/viewer/view_link.js";
+const pause = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
+const box = document.getElementById("viewer"), find = (selector) => box.querySelector(selector);
+const until = async (holds) => { while (!holds()) await pause(30); };
+const press = (name) => find(`[data-do=${name}]`).click();
+const place = () => find(".place").textContent;
+const canvas = find("canvas:not(.overlay)");
+BEFORE
+await import("/files/viewer/page.js");
+window.result = (async () => { BODY })();
+</script>"""
+
+
+def view(name: str, aspect: float, **more: Any) -> dict[str, Any]:
+    fixed = {"position": [0, 0, -4], "forward": [0, 0, 1], "up": [0, -1, 0], "fov_y_degrees": 40}
+    return {"name": name, "aspect": aspect, "held_out": False, "nearest_world": 0, **fixed, **more}
+
+
+def in_viewer(body: str, folder: Path, views: list[dict[str, Any]], before: str = "", **box: str) -> Any:
+    write_gaussian_ply(shell_scene(300), folder / "scene.ply")
+    cameras = {"up": [0, -1, 0], "target": [0, 0, 0], "radius": 4, "views": views}
+    (folder / "cameras.json").write_text(json.dumps(cameras))
+    files = {path.relative_to(STATIC).as_posix(): path for path in STATIC.rglob("*.js")}
+    files |= {name: folder / name for name in ("scene.ply", "cameras.json")}
+    page = render_template(
+        "viewer.html", name="a scene", page="/files/", size_bytes=1000, q=9.21, background="black"
+    )
+    page = re.sub(r"<script.*?</script>|<link .*?>", "", page).replace("</head>", f"{STYLE}</head>")
+    for name, value in box.items():
+        page = re.sub(f' data-{name}="[^"]*"', f' data-{name}="{value}"', page)
+    script = SCRIPT.replace("BODY", body).replace("BEFORE", before)
+    shown = open_page(page.replace("</body>", f"{script}</body>"), files=files, width=400, height=500)
+    assert shown.result is not None, shown.messages
+    return shown.result
+
+
+THREE = [view("a.jpg", 0.5), view("b.jpg", 1.0), view("c.jpg", 2.5)]
+READY = 'await until(() => box.dataset.ready === "yes");'
+
+
+def test_step_back_from_a_place_of_no_photograph_goes_to_the_last_one(tmp_path: Path) -> None:
+    found = in_viewer(
+        READY
+        + """
+        const places = [];
+        for (const step of ["previous", "next"]) {
+            location.hash = `#view=0,0,-3,0,0,0,${step.length + 40}`;
+            await pause(100);
+            press(step);
+            places.push(place());
+        }
+        return places;
+        """,
+        tmp_path,
+        THREE,
+    )
+    assert found == ["c.jpg", "a.jpg"]
+
+
+def test_link_opens_as_wide_as_it_was_copied(tmp_path: Path) -> None:
+    """In a narrow window a wide photograph is seen wholly, by a wider angle, which a link has to tell."""
+    found = in_viewer(
+        READY
+        + """
+        const saved = [], original = Blob;
+        window.Blob = class extends original {
+            constructor(parts, options) {
+                super(parts, options);
+                if (options?.type === "application/json") saved.push(JSON.parse(parts[0]));
+            }
+        };
+        const angle = () => {
+            for (const name of ["clear-path", "key", "save-path"]) press(name);
+            return saved.at(-1).frames[0].fov_y_degrees;
+        };
+        press("previous");
+        await pause(200);
+        const wide = angle();
+        press("link");
+        const hash = location.hash;
+        press("next");
+        await pause(200);
+        const narrow = angle();
+        history.replaceState(null, "", location.pathname);
+        location.hash = hash;
+        await pause(300);
+        return [wide, narrow, angle(), viewOf(hash).aspect];
+        """,
+        tmp_path,
+        THREE,
+    )
+    wide, narrow, again, aspect = found
+    assert wide > narrow + 5 and again == pytest.approx(wide) and aspect == 2.5
+
+
+def test_newer_scene_is_shown_where_the_first_could_not_be_loaded(tmp_path: Path) -> None:
+    found = in_viewer(
+        """
+        await Promise.race([until(() => box.dataset.ready === "yes"), pause(8000)]);
+        return [box.dataset.ready, find(".count").textContent, find(".veil").hidden];
+        """,
+        tmp_path,
+        THREE,
+        """
+        const post = Worker.prototype.postMessage;
+        Worker.prototype.postMessage = function (message, ...others) {
+            post.call(this, message, ...others);
+            if (!message.load?.endsWith("gone.ply")) return;
+            box.dispatchEvent(new CustomEvent("scene", { detail: { scene: "/files/scene.ply", count: "newer" } }));
+        };
+        """,
+        scene="/files/gone.ply",
+    )
+    assert found == ["yes", "newer", True]
