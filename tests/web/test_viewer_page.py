@@ -135,3 +135,39 @@ def test_newer_scene_is_shown_where_the_first_could_not_be_loaded(tmp_path: Path
         scene="/files/gone.ply",
     )
     assert found == ["yes", "newer", True]
+
+
+def test_scene_comes_back_with_the_graphics_of_the_device(tmp_path: Path) -> None:
+    found = in_viewer(
+        """
+        await until(() => box.dataset.rested === "yes");
+        /** The mean of what the canvas shows. */
+        const brightness = async () => {
+            const image = await createImageBitmap(canvas);
+            const context = new OffscreenCanvas(image.width, image.height).getContext("2d");
+            context.drawImage(image, 0, 0);
+            const { data } = context.getImageData(0, 0, image.width, image.height);
+            return data.reduce((sum, value, k) => sum + (k % 4 < 3 ? value : 0), 0) / (0.75 * data.length);
+        };
+        const before = await brightness();
+        const stopper = canvas.getContext("webgl2").getExtension("WEBGL_lose_context");
+        stopper.loseContext();
+        await pause(200);
+        const lost = [find(".veil").hidden, find(".veil-text").textContent];
+        press("background"); // which would draw
+        press("background");
+        await pause(300);
+        stopper.restoreContext();
+        await pause(300);
+        await Promise.race([until(() => box.dataset.rested === "yes"), pause(8000)]);
+        return { before, lost, after: await brightness(), veil: find(".veil").hidden };
+        """,
+        tmp_path,
+        THREE,
+        """
+        const original = canvas.getContext.bind(canvas);
+        canvas.getContext = (kind, options) => original(kind, { ...options, preserveDrawingBuffer: true });
+        """,
+    )
+    assert found["lost"] == [False, "The graphics of this device have stopped; the scene comes back with them."]
+    assert found["veil"] and found["before"] > 5 and found["after"] == pytest.approx(found["before"], rel=0.02)

@@ -151,6 +151,26 @@ class Viewer extends LoadingViewer {
         if (scene !== loaded) this.renew({ scene, count }); // also where the one before could not be shown
     }
 
+    /** The device has taken back its graphics memory, as phones do while another page is looked at. */
+    lose() {
+        this.isLost = true;
+        this.veil.hidden = false;
+        this.veil.querySelector("progress").hidden = true;
+        this.say("The graphics of this device have stopped; the scene comes back with them.");
+    }
+
+    async restore() {
+        try {
+            await this.splats.setScene(this.scene, this.q);
+        } catch (error) {
+            this.fail(error);
+            return;
+        }
+        this.isLost = false;
+        this.sorting.forget();
+        this.wake();
+    }
+
     async loadCameras() {
         try {
             const response = await fetch(this.box.dataset.cameras);
@@ -175,6 +195,8 @@ class Viewer extends LoadingViewer {
         tools.querySelector(".views").addEventListener("change", ({ target }) => target.value && this.do("view", Number(target.value)));
         tools.querySelector("[data-do=full]").hidden = !document.fullscreenEnabled;
         this.splats.setBackground(...BACKGROUNDS[this.background]);
+        this.canvas.addEventListener("webglcontextlost", () => this.lose());
+        this.canvas.addEventListener("webglcontextrestored", () => this.restore());
         this.takeLight();
         new ResizeObserver(() => this.resize()).observe(this.canvas.parentElement);
         this.resize();
@@ -200,7 +222,7 @@ class Viewer extends LoadingViewer {
             this.isStale = true;
             this.added = null;
             Object.assign(this.box.dataset, { ready: "yes", drawn: "part" });
-            this.veil.hidden = true;
+            this.veil.hidden = !this.isLost;
         });
         this.scene = scene;
         this.box.querySelector(".count").textContent = this.box.dataset.count || `${thousands(scene.count)} Gaussians`;
@@ -360,7 +382,7 @@ class Viewer extends LoadingViewer {
         if (this.limits.clamp(this.camera.position) && !this.walking.flying) this.camera.lookAt(this.controls.target);
         // Once for each change: a page that changes in every frame leaves a software renderer no time for the scene.
         if (this.isOverlayStale) this.drawOverlay();
-        if (this.isBusy || !this.isStale) return;
+        if (this.isBusy || this.isLost || !this.isStale) return;
         this.camera.updateMatrixWorld();
         if (performance.now() - this.movedAt < REST_MS) this.drawMoving();
         else this.drawResting();
