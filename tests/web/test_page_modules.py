@@ -138,3 +138,31 @@ def test_preview_without_a_picture_is_told(artifacts: list[dict[str, str]], stat
         status=status,
     )
     assert found == [None, words]
+
+
+def test_end_of_a_job_takes_nothing_away_that_is_being_written() -> None:
+    """The page is loaded again once what was written is kept or deleted; each time it begins anew here."""
+    page = """<!doctype html><html><body><section id="status"></section>
+    <input type="text" value="a name"><section id="about" data-job="1" data-state="running"></section>
+    <details id="log-fold"><pre id="log"></pre></details>
+    <script type="module">
+    const pause = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
+    const seen = JSON.parse(sessionStorage.seen ?? "[]"), field = document.querySelector("input");
+    const see = (what) => { seen.push(what); sessionStorage.seen = JSON.stringify(seen); };
+    let over = null;
+    window.fetch = async () => new Response('{"events": []}');
+    window.EventSource = class extends EventTarget { constructor() { super(); over = this; } close() {} };
+    see("loaded");
+    if (seen.length > 1) window.result = seen;
+    else {
+        await import("/files/job.js");
+        while (!over) await pause(20);
+        field.value = "half of a na";
+        over.dispatchEvent(new MessageEvent("state", { data: '{"state": "succeeded"}', lastEventId: "1" }));
+        await pause(1500);
+        see(field.value);
+        field.value = "a name";
+    }
+    </script></body></html>"""
+    files = {path.relative_to(STATIC).as_posix(): path for path in STATIC.rglob("*.js")}
+    assert open_page(page, files=files).result == ["loaded", "half of a na", "loaded"]

@@ -24,6 +24,13 @@ function refresh() {
     document.body.dispatchEvent(new CustomEvent("job-news"));
 }
 
+/** Loads the page again, as it has other parts by now; not while something is written, which would be gone. */
+function showAnew() {
+    const isWritten = [...document.querySelectorAll("input[type=text], textarea")].some((field) => field.value !== field.defaultValue && field.checkVisibility());
+    if (isWritten) setTimeout(showAnew, 1000);
+    else location.reload();
+}
+
 function showPreview({ step, view }) {
     const box = document.getElementById("preview");
     if (!box) return;
@@ -83,7 +90,7 @@ function hear(kind, data, id, isNew) {
         if (isNew) showDecibels("live-psnr", data.psnr);
     } else if (kind === "preview" && isNew && data.view) showPreview(data); // without a view it is a map of blocks
     else if (kind === "live_scene" && isNew) showLiveScene(data);
-    else if (kind === "state" && isNew && isOver(data.state)) location.reload();
+    else if (kind === "state" && isNew && isOver(data.state)) showAnew();
     else if (isNew) refresh();
 }
 
@@ -159,7 +166,7 @@ async function followLog() {
 
 document.addEventListener("job-changed", ({ detail }) => {
     // A retried job has a life ahead of it again.
-    if (isOver(about.dataset.state) !== isOver(detail.state)) location.reload();
+    if (isOver(about.dataset.state) !== isOver(detail.state)) showAnew();
 });
 const logFold = document.getElementById("log-fold");
 if (logFold.open) followLog();
