@@ -160,6 +160,25 @@ def test_points_are_picked_where_half_of_the_light_is_stopped(tmp_path: Path) ->
     np.testing.assert_allclose(found[3], [0, 0, 1], atol=1e-6)  # the veil alone stops most of what is stopped
 
 
+def test_what_is_too_faint_to_be_drawn_is_not_picked(tmp_path: Path) -> None:
+    """Two hundred Gaussians too faint for an octagon, before a wall."""
+    count = 201
+    means = np.zeros((count, 3), np.float32)
+    means[:, 2] = np.linspace(1, 3, count)
+    opacities = np.full(count, 0.009)
+    opacities[-1] = 0.99
+    scene = FlatGaussians(
+        means_world=means,
+        quats_wxyz=np.tile(np.float32([1, 0, 1, 0]), (count, 1)),
+        log_scales=np.full((count, 2), np.log(0.5), np.float32),
+        opacity_logits=np.log(opacities / (1 - opacities)).astype(np.float32),
+        sh=np.zeros((count, 1, 3), np.float32),
+    )
+    write_gaussian_ply(scene, tmp_path / "scene.ply")
+    found = in_page(READ + "return pick(scene, [0, 0, 0], [0, 0, 1], 9.21);", tmp_path / "scene.ply")
+    np.testing.assert_allclose(found, [0, 0, 3], atol=1e-6)
+
+
 def test_what_is_not_drawn_is_not_picked(tmp_path: Path) -> None:
     """A streak that no photograph shows, before a wall that they show, is passed by as in the picture."""
     scene = FlatGaussians(
