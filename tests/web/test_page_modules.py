@@ -166,3 +166,15 @@ def test_end_of_a_job_takes_nothing_away_that_is_being_written() -> None:
     </script></body></html>"""
     files = {path.relative_to(STATIC).as_posix(): path for path in STATIC.rglob("*.js")}
     assert open_page(page, files=files).result == ["loaded", "half of a na", "loaded"]
+
+
+def test_link_to_a_view_outlives_the_sign_in() -> None:
+    found = in_page(
+        """
+        location.hash = "#view=1,2,3,4,5,6,50";
+        await import("/files/app.js");
+        return document.querySelector("[name=next]").value;
+        """,
+        '<form class="card sign-in"><input type="hidden" name="next" value="/jobs/1"></form>',
+    )
+    assert found == "/jobs/1#view=1,2,3,4,5,6,50"

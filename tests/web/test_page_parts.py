@@ -1,9 +1,11 @@
 """Pages without a browser: headers, errors as pages, owners, escaping, words."""
 
 import datetime
+import html
 import re
 import subprocess
 import sys
+import urllib.parse
 import uuid
 
 import pytest
@@ -160,6 +162,13 @@ async def test_job_list_shows_own_jobs_only(connect_service: ConnectService, dat
         assert (await http.get("/new", headers=as_user["eve"])).status_code == 403
         unknown = await http.get("/new")
         assert unknown.status_code == 303 and unknown.headers["location"] == "/sign-in?next=/new"
+        asked = await http.get("/compare", params={"job": ["1", "2"], "view": "a b.png"})
+        following = "/compare?job=1&job=2&view=a+b.png"
+        wanted = "/sign-in?next=" + urllib.parse.quote(following, safe="/")
+        assert asked.status_code == 303 and asked.headers["location"] == wanted
+        assert f'value="{html.escape(following)}"' in (await http.get(wanted)).text
+        long = await http.get("/compare", params={"job": ["1" * 40] * 60})
+        assert long.headers["location"] == "/sign-in?next=/compare"
         part = await http.get("/parts/jobs", headers={"HX-Request": "true"})
         assert part.status_code == 200 and part.headers["hx-redirect"].startswith("/sign-in")
 

@@ -33,3 +33,7 @@ document.addEventListener("htmx:after:swap", () => {
 document.addEventListener("invalid", ({ target }) => {
     for (let fold = target.closest("details"); fold; fold = fold.parentElement.closest("details")) fold.open = true;
 }, { capture: true });
+
+// A link to a view has it behind #, which no server hears of: a sign-in on the way hands it on.
+const next = document.querySelector(".sign-in [name=next]");
+if (next && location.hash) next.value += location.hash;

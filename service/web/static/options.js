@@ -118,7 +118,7 @@ export async function queueJob(body, key) {
 /** The JSON of an answer, or an error with the problem's words. */
 export async function answer(response) {
     if (response.ok) return response.json();
-    if (response.status === 401) location.href = `/sign-in?next=${encodeURIComponent(location.pathname)}`;
+    if (response.status === 401) location.href = `/sign-in?next=${encodeURIComponent(location.pathname + location.search + location.hash)}`;
     const problem = await response.json().catch(() => ({}));
     const error = new Error(problem.detail ?? `The service answered ${response.status}.`);
     error.status = response.status;
