@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 import octasplat.service.web as service_web
+from octasplat.service.web.formatting import format_duration, format_thousands
 from tests.support.browser import open_page
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]
@@ -178,3 +179,17 @@ def test_link_to_a_view_outlives_the_sign_in() -> None:
         '<form class="card sign-in"><input type="hidden" name="next" value="/jobs/1"></form>',
     )
     assert found == "/jobs/1#view=1,2,3,4,5,6,50"
+
+
+def test_scripts_write_numbers_and_times_as_the_service_does() -> None:
+    seconds = [0, 59.4, 61, 119.7, 600, 3599, 3600, 9000, 86_399, 86_400, 200_000]
+    numbers = [0, 999, 1000, 1_234_567]
+    found = in_page(
+        """
+        const { duration, thousands } = await import("/files/numbers.js");
+        return [job.seconds.map(duration), job.numbers.map((value) => thousands(value))];
+        """,
+        seconds=seconds,
+        numbers=numbers,
+    )
+    assert found == [[format_duration(value) for value in seconds], [format_thousands(n) for n in numbers]]

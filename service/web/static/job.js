@@ -2,7 +2,7 @@
 
 import { Charts, Training } from "./charts.js";
 import { comparison } from "./compare.js";
-import { thousands } from "./numbers.js";
+import { duration, thousands } from "./numbers.js";
 import "./table.js";
 import "./job_forms.js";
 
@@ -61,7 +61,7 @@ function showProgress(event) {
     bar.value = step;
     const left = event.seconds_left == null ? "" : ` · ${duration(event.seconds_left)} left`;
     const name = text.querySelector("b");
-    if (event.stage && name) name.textContent = event.stage;
+    if (event.stage && name) name.textContent = event.stage.replaceAll("_", " ");
     if (name) text.replaceChildren(name, ` ${thousands(step)}/${thousands(total)}${left}`);
     showDecibels("live-training-psnr", event.training_psnr);
     if (event.gaussians != null) document.getElementById("live-gaussians")?.replaceChildren(thousands(event.gaussians));
@@ -69,14 +69,6 @@ function showProgress(event) {
 
 function showDecibels(id, value) {
     if (value != null) document.getElementById(id)?.replaceChildren(value.toFixed(2), Object.assign(document.createElement("small"), { textContent: " dB" }));
-}
-
-function duration(seconds) {
-    const whole = Math.max(0, Math.round(seconds));
-    if (whole < 60) return `${whole} s`;
-    const minutes = Math.floor(whole / 60);
-    if (minutes < 60) return minutes < 10 && whole % 60 ? `${minutes} min ${whole % 60} s` : `${minutes} min`;
-    return `${Math.floor(minutes / 60)} h ${minutes % 60} min`;
 }
 
 /** Takes an event; `isNew` is false while the past is read. */
