@@ -95,3 +95,21 @@ def test_what_is_wrong_is_told_and_hinders_nothing_else() -> None:
     )
     assert found["said"].startswith("Groups smaller than: ") and found["later"] > found["edited"]
     assert [body["kind"] for body in found["asked"]] == ["crop"] and found["fault"] == "not now"
+
+
+def test_look_that_fails_is_told() -> None:
+    found = in_panel(
+        """
+        // As it holds no scene yet, the worker can look at nothing.
+        const worker = new Worker("/files/viewer/scene_worker.js", { type: "module" });
+        const answer = await Promise.race([pause(3000), new Promise((resolve) => {
+            worker.onmessage = ({ data }) => resolve(data);
+            worker.onerror = () => resolve(null);
+            worker.postMessage({ edit: { box: null, clean: null }, show: "kept" });
+        })]);
+        if (answer) viewer.box.dispatchEvent(new CustomEvent("edited", { detail: answer.edited }));
+        return panel.state.textContent;
+        """,
+        [0.0, 0.0, 0.0],
+    )
+    assert found.startswith("What this would do cannot be shown here (")

@@ -111,7 +111,11 @@ export class EditPanel {
         return this.inFile(box).map((value, k) => value.toFixed(decimalsOf(step(k) / 10)));
     }
 
-    tell({ counts, kept }) {
+    tell({ counts, kept, error }) {
+        if (error) {
+            this.state.textContent = `What this would do cannot be shown here (${error}); a job can do it.`;
+            return;
+        }
         const reasons = Object.entries(counts).filter(([, number]) => number).map(([reason, number]) => `${thousands(number)} ${WORDS[reason]}`);
         this.state.textContent = `${thousands(kept)} Gaussians stay${reasons.length ? `; ${reasons.join(", ")}` : ""}.`;
         this.viewer.box.dataset.edited = JSON.stringify({ ...counts, kept });

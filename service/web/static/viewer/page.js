@@ -84,6 +84,7 @@ class Viewer extends LoadingViewer {
                 if (data.scene) {
                     this.worker?.terminate();
                     this.worker = worker;
+                    worker.onerror = null;
                     this.picks.forEach((found) => found(null)); // which nobody answers any more
                     this.picks.clear();
                     resolve(data.scene);
