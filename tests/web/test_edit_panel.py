@@ -113,3 +113,21 @@ def test_look_that_fails_is_told() -> None:
         [0.0, 0.0, 0.0],
     )
     assert found.startswith("What this would do cannot be shown here (")
+
+
+def test_job_is_asked_for_once() -> None:
+    found = in_panel(
+        """
+        fill("crop", true);
+        const button = form.querySelector("[value=crop]");
+        button.click();
+        button.click();
+        await pause(100);
+        const once = asked.length;
+        button.click(); // as the first was refused
+        await pause(100);
+        return [once, asked.length];
+        """,
+        [0.0, 0.0, 0.0],
+    )
+    assert found == [1, 2]

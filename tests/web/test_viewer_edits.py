@@ -27,6 +27,7 @@ PAGE = """<!doctype html>
 <html><body><script type="module">
 import { PerspectiveCamera, Vector3 } from "/files/vendor/three.js";
 import { removedBy } from "/files/viewer/cleaning.js";
+import { readHdr } from "/files/viewer/environment.js";
 import { toHalf } from "/files/viewer/half.js";
 import { makeTree } from "/files/viewer/nearest.js";
 import { pick } from "/files/viewer/picking.js";
@@ -240,3 +241,14 @@ def test_half_precision_numbers_are_the_nearest() -> None:
     )
     shown = np.uint16(found).view(np.float16)
     np.testing.assert_array_equal(shown, np.float16([*values, *[65504.0] * len(beyond)]))
+
+
+@pytest.mark.parametrize("kind", ["rgbe", "xyze"])
+def test_maps_in_other_colors_are_refused(kind: str) -> None:
+    header = f"#?RADIANCE\n# FORMAT=none\nFORMAT=32-bit_rle_{kind}\n\n-Y 1 +X 2\n"
+    found = in_page(
+        "try { return [...readHdr(new TextEncoder().encode(job.text).buffer).data]; } catch ({ message }) { return message; }",
+        text=header + "@@@\x7f" * 2,
+    )
+    refused = "The 3D view takes light from Radiance HDR files only."
+    assert found == ([0.125] * 6 if kind == "rgbe" else refused)

@@ -122,14 +122,15 @@ export class EditPanel {
     }
 
     async queue(kind) {
+        if (this.isQueuing) return; // pressed twice, there would be two jobs
         const { box, clean } = this.wanted(), fault = this.form.querySelector(".fault");
-        fault.hidden = true;
+        fault.hidden = this.isQueuing = true;
         const options = kind === "crop" ? { box: this.inFile(box) } : clean;
         try {
             location.href = `/jobs/${await queueJob({ kind, source_id: this.source, options }, crypto.randomUUID?.() ?? String(Math.random()))}`;
         } catch (error) {
             fault.textContent = [error.message, ...(error.faults ?? [])].join(" ");
-            fault.hidden = false;
+            fault.hidden = this.isQueuing = false;
         }
     }
 }
