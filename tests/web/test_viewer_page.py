@@ -171,3 +171,24 @@ def test_scene_comes_back_with_the_graphics_of_the_device(tmp_path: Path) -> Non
     )
     assert found["lost"] == [False, "The graphics of this device have stopped; the scene comes back with them."]
     assert found["veil"] and found["before"] > 5 and found["after"] == pytest.approx(found["before"], rel=0.02)
+
+
+def test_photograph_can_be_chosen_again_after_its_place_was_left(tmp_path: Path) -> None:
+    found = in_viewer(
+        READY
+        + """
+        const list = find(".views");
+        list.value = "1";
+        list.dispatchEvent(new Event("change", { bubbles: true }));
+        await pause(200);
+        const values = [list.value];
+        canvas.dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowLeft", code: "ArrowLeft" }));
+        await pause(300);
+        canvas.dispatchEvent(new KeyboardEvent("keyup", { key: "ArrowLeft", code: "ArrowLeft" }));
+        await pause(100);
+        return [...values, list.value];
+        """,
+        tmp_path,
+        THREE,
+    )
+    assert found == ["1", ""]

@@ -395,6 +395,7 @@ class Viewer extends LoadingViewer {
             this.leavesAt = null;
             this.overlay.chosen = -1;
             this.photograph.leave();
+            this.box.querySelector(".views").value = ""; // so that it can be chosen again
         }
         this.overlay.draw(this.camera);
         this.isOverlayStale = false;
