@@ -60,8 +60,10 @@ def test_box_of_a_scene_far_from_the_origin_is_as_fine_as_any(origin: list[float
     found = in_panel(
         """
         fill("crop", true);
-        const link = document.getElementById("edit-region").href.split("#region=")[1].split(",").map(Number);
-        const low = form.elements.x_low, shown = () => form.querySelector("output[for=edit-x-low]").textContent;
+        const { href } = document.getElementById("edit-region");
+        const link = href.split("#region=")[1].split(",").map(Number);
+        const low = form.elements.x_low, output = form.querySelector("output[for=edit-x-low]");
+        const shown = () => output.textContent;
         const texts = [];
         for (let k = 0; k < 3; k++) {
             texts.push(shown());

@@ -1,6 +1,5 @@
 """The forms of light by themselves: files that take long to read, and what the service says of a stage."""
 
-import json
 import uuid
 from pathlib import Path
 from types import SimpleNamespace
@@ -45,7 +44,9 @@ def in_form(template: str, values: dict[str, Any], body: str, files: dict[str, P
 
 
 RELIGHT_PAGE = """
-const maps = await Promise.all(["dim", "bright"].map((name) => original(`/files/${name}.hdr`).then((answer) => answer.arrayBuffer())));
+const maps = await Promise.all(["dim", "bright"].map(
+    async (name) => (await original(`/files/${name}.hdr`)).arrayBuffer(),
+));
 let late = 0;
 window.fetch = async (address) => {
     if (!String(address).includes("environment.hdr")) return new Response(maps[1]);
@@ -53,7 +54,9 @@ window.fetch = async (address) => {
     return status === 200 ? new Response(maps[0]) : json({ detail: "It is gone." }, status);
 };
 const heard = [];
-find("viewer").addEventListener("light", ({ detail: { map, degrees } }) => heard.push([map && map.data[0], degrees]));
+find("viewer").addEventListener("light", ({ detail }) => {
+    heard.push([detail.map && detail.map.data[0], detail.degrees]);
+});
 await import("/files/relight/page.js");
 const live = find("relight-live"), turned = find("relight-rotation_degrees");
 const choose = (value) => { live.value = value; fire(live, "change"); };
@@ -112,7 +115,8 @@ LIGHT_PAGE = """
 const asked = [];
 window.fetch = async (address, { body } = {}) => {
     const path = String(address);
-    if (path.endsWith("cameras.json")) return json({ up: [0, 0, 1], target: [0, 0, 0], radius: 5, views: [{ name: "a.jpg", forward: [1, 0, 0] }] });
+    const views = [{ name: "a.jpg", forward: [1, 0, 0] }];
+    if (path.endsWith("cameras.json")) return json({ up: [0, 0, 1], target: [0, 0, 0], radius: 5, views });
     asked.push([path, JSON.parse(body)]);
     return estimate(JSON.parse(body));
 };
@@ -159,7 +163,8 @@ def test_what_is_wrong_with_a_stage_is_told_by_itself() -> None:
     return [asked.length, document.querySelector(".light-estimate").textContent];
     """
     refusal = 'const estimate = () => json({ errors: [{ detail: "The lamp is too large." }] }, 422);'
-    taken = 'const estimate = ({ options }) => json({ estimate: { text: options.mode === "views" ? "5 s" : "2 min" } });'
+    text = 'options.mode === "views" ? "5 s" : "2 min"'
+    taken = f"const estimate = ({{ options }}) => json({{ estimate: {{ text: {text} }} }});"
     assert in_form("_light.html", LIGHT, refusal + page + body) == [2, "The lamp is too large."]
     assert in_form("_light.html", LIGHT, taken + page + body) == [
         2,

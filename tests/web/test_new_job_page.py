@@ -15,14 +15,18 @@ STATIC = Path(service_web.__file__).parent / "static"
 PAGE = """<!doctype html>
 <html><body>
 <form id="new-job" data-kind="reconstruct" data-given='GIVEN'>
-<div id="drop"><button type="button" data-pick="pick-folder">Folder</button><input type="file" id="pick-folder" multiple>
+<div id="drop"><button type="button" data-pick="pick-folder">Folder</button>
+<input type="file" id="pick-folder" multiple>
 <button type="button" data-pick="pick-files">Files</button><input type="file" id="pick-files" multiple></div>
-<div id="chosen" hidden><p id="chosen-text" tabindex="-1"></p><button type="button" id="forget">Others</button>
+<div id="chosen" hidden><p id="chosen-text" tabindex="-1"></p>
+<button type="button" id="forget">Others</button>
 <ul id="chosen-notes"></ul></div>
 <select id="dataset"><option value=""><option value="known"></select>
-<fieldset data-path="preset" data-type="radio" data-default="standard"><input type="radio" name="preset" value="standard" checked></fieldset>
+<fieldset data-path="preset" data-type="radio" data-default="standard">
+<input type="radio" name="preset" value="standard" checked></fieldset>
 <label for="label">Name</label><input id="label">
-<label for="steps">Steps</label><input id="steps" type="number" data-path="train.iterations" data-type="number" data-default="">
+<label for="steps">Steps</label>
+<input id="steps" type="number" data-path="train.iterations" data-type="number" data-default="">
 <label for="odd">Odd</label><input id="odd" data-path="train.odd" data-type="json" data-default="">
 <fieldset data-path="exports" data-type="files"><legend>Files</legend>
 <label class="check"><input type="checkbox" value="viewer.glb" checked></label>
@@ -44,8 +48,9 @@ window.fetch = async (address, { method = "GET", body } = {}) => {
     return new Response(JSON.stringify(content), { status });
 };
 answers["POST /v1/scene-previews"] = ({ files }) => ({ content: {
-    files: files.map(({ path, size_bytes }) => ({ name: `images/${path}`, path, size_bytes })), folder: "", notes: [],
-    refusals: files.length ? [] : [{ detail: "There are no photographs." }], photographs: files.length, has_poses: false,
+    files: files.map(({ path, size_bytes }) => ({ name: `images/${path}`, path, size_bytes })),
+    refusals: files.length ? [] : [{ detail: "There are no photographs." }],
+    folder: "", notes: [], photographs: files.length, has_poses: false,
 } });
 const choose = (...names) => {
     const transfer = new DataTransfer();
@@ -97,7 +102,8 @@ def test_nothing_else_is_begun_while_photographs_are_sent() -> None:
         await pause(100);
         find("start").click();
         await pause(100);
-        return { text: find("chosen-text").textContent, asked: asked.filter(([, path]) => path === "/v1/datasets").length };
+        const begun = asked.filter(([, path]) => path === "/v1/datasets");
+        return { text: find("chosen-text").textContent, asked: begun.length };
         """
     )
     assert "1 photographs" in found["text"] and found["asked"] == 1
@@ -130,11 +136,13 @@ def test_word_that_is_dropped_on_a_field_leaves_the_photographs() -> None:
         """
         choose("a.jpg");
         await pause(100);
-        const event = new DragEvent("drop", { bubbles: true, cancelable: true, dataTransfer: new DataTransfer() });
+        const dataTransfer = new DataTransfer();
+        const event = new DragEvent("drop", { bubbles: true, cancelable: true, dataTransfer });
         event.dataTransfer.setData("text/plain", "a name");
         find("label").dispatchEvent(event);
         await pause(200);
-        return { stopped: event.defaultPrevented, chosen: !find("chosen").hidden, faults: find("faults").textContent };
+        const chosen = !find("chosen").hidden;
+        return { stopped: event.defaultPrevented, chosen, faults: find("faults").textContent };
         """
     )
     assert found == {"stopped": False, "chosen": True, "faults": ""}

@@ -57,7 +57,8 @@ window.fetch = async (address, { method }) => {
     return status === 204 ? new Response(null, { status }) : json({ detail: "not now" }, status);
 };
 const upload = new Upload({ files: [], bytes: 0 }, "title", () => {});
-const error = await upload.removeOthers("d", new Map([["images/a.jpg", {}], ["images/old b.jpg", {}]]), [{ name: "images/a.jpg" }])
+const there = new Map([["images/a.jpg", {}], ["images/old b.jpg", {}]]);
+const error = await upload.removeOthers("d", there, [{ name: "images/a.jpg" }])
     .then(() => null, ({ message }) => message);
 return { error, deleted };
 """

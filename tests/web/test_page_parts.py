@@ -124,9 +124,7 @@ async def test_names_of_users_are_text(connect_service: ConnectService, database
             assert HOSTILE not in text and "&#34;&gt;&lt;img" in text
 
 
-async def test_job_that_is_run_again_keeps_its_queue(
-    connect_service: ConnectService, database: str
-) -> None:
+async def test_job_that_is_run_again_keeps_its_queue(connect_service: ConnectService, database: str) -> None:
     async with connect_service() as (http, _):
         job = await make_job(database, queue="night")
         page = (await http.get("/new", params={"like": str(job)})).text

@@ -209,8 +209,16 @@ def test_what_is_not_drawn_is_not_picked(tmp_path: Path) -> None:
 def test_links_keep_a_view_and_nothing_else_is_taken_for_one() -> None:
     found = in_page(
         "const link = linkOf([1.25, -2, 1e-7], [0, 3.5, -40000], 51.5, 0.75);"
-        "return { link, view: viewOf(link), older: viewOf('#view=1,2,3,4,5,6,50'), others: job.others.map(viewOf) };",
-        others=["", "#h-view", "#view=1,2,3", "#view=1,2,3,4,5,6,x", "#view=1,2,3,4,5,6,1e999", "#view=1,2,3,4,5,6,7,8,9"],
+        "const older = viewOf('#view=1,2,3,4,5,6,50');"
+        "return { link, view: viewOf(link), older, others: job.others.map(viewOf) };",
+        others=[
+            "",
+            "#h-view",
+            "#view=1,2,3",
+            "#view=1,2,3,4,5,6,x",
+            "#view=1,2,3,4,5,6,1e999",
+            "#view=1,2,3,4,5,6,7,8,9",
+        ],
     )
     expected = {"position": [1.25, -2, 1e-7], "target": [0, 3.5, -40000], "fovY": 51.5, "aspect": 0.75}
     assert found["view"] == expected
@@ -247,7 +255,8 @@ def test_half_precision_numbers_are_the_nearest() -> None:
 def test_maps_in_other_colors_are_refused(kind: str) -> None:
     header = f"#?RADIANCE\n# FORMAT=none\nFORMAT=32-bit_rle_{kind}\n\n-Y 1 +X 2\n"
     found = in_page(
-        "try { return [...readHdr(new TextEncoder().encode(job.text).buffer).data]; } catch ({ message }) { return message; }",
+        "const read = () => [...readHdr(new TextEncoder().encode(job.text).buffer).data];"
+        "try { return read(); } catch ({ message }) { return message; }",
         text=header + "@@@\x7f" * 2,
     )
     refused = "The 3D view takes light from Radiance HDR files only."

@@ -20,11 +20,13 @@ PAGE = """<!doctype html>
 import { Vector3 } from "/files/vendor/three.js";
 import { Marks } from "/files/viewer/marks.js";
 const pause = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
-const box = document.getElementById("box"), canvas = box.querySelector("canvas"), form = box.querySelector("form");
+const box = document.getElementById("box");
+const canvas = box.querySelector("canvas"), form = box.querySelector("form");
 const picks = [];
 const viewer = {
-    box, canvas, overlay: { segment: [] }, place: document.createElement("p"), camera: { position: new Vector3() },
-    controls: { target: new Vector3() }, wake() {}, pick: () => new Promise((resolve) => picks.push(resolve)),
+    box, canvas, overlay: { segment: [] }, place: document.createElement("p"), wake() {},
+    camera: { position: new Vector3() }, controls: { target: new Vector3() },
+    pick: () => new Promise((resolve) => picks.push(resolve)),
 };
 let stored = [];
 window.fetch = async (_address, { method = "GET", body } = {}) => {
@@ -32,7 +34,8 @@ window.fetch = async (_address, { method = "GET", body } = {}) => {
     if (method === "PATCH") stored = JSON.parse(body).view_notes;
     return new Response(JSON.stringify({ view_notes: stored }), { headers: { ETag: '"1"' } });
 };
-const marks = new Marks(viewer), enter = (target = canvas) => target.dispatchEvent(new KeyboardEvent("keydown", { key: "Enter" }));
+const marks = new Marks(viewer);
+const enter = () => canvas.dispatchEvent(new KeyboardEvent("keydown", { key: "Enter" }));
 window.result = (async () => { BODY })();
 </script></body></html>
 """
@@ -56,7 +59,8 @@ def test_note_that_is_sent_twice_is_kept_once() -> None:
         form.requestSubmit();
         form.requestSubmit();
         await pause(600);
-        return { texts: stored.map(({ text }) => text), mode: marks.mode, focus: document.activeElement.tagName };
+        const texts = stored.map(({ text }) => text);
+        return { texts, mode: marks.mode, focus: document.activeElement.tagName };
         """
     )
     assert found == {"texts": ["a note"], "mode": None, "focus": "CANVAS"}

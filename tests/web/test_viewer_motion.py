@@ -138,13 +138,15 @@ def test_keys_do_what_is_on_them() -> None:
     found = in_page(
         """
         return job.keys.map(([key, code]) => {
-            const canvas = document.createElement("canvas"), camera = new PerspectiveCamera(50, 1, 0.1, 100), done = [];
+            const canvas = document.createElement("canvas"), done = [];
+            const camera = new PerspectiveCamera(50, 1, 0.1, 100);
             camera.position.set(0, 0, 5);
             const controls = { target: new Vector3() };
             const walking = new Walking(canvas, camera, controls, 1, (action) => done.push(action), () => {});
             canvas.dispatchEvent(new KeyboardEvent("keydown", { key, code }));
             walking.step(0.05);
-            canvas.dispatchEvent(new KeyboardEvent("keyup", { key: "*", code })); // with Shift pressed meanwhile
+            // With Shift pressed meanwhile.
+            canvas.dispatchEvent(new KeyboardEvent("keyup", { key: "*", code }));
             const { z } = camera.position;
             walking.step(0.05);
             return [done[0] ?? (z < 5 ? "nearer" : z > 5 ? "farther" : null), camera.position.z === z];
@@ -161,9 +163,7 @@ def test_nothing_that_photographs_show_is_left_out_of_a_large_scene(overlap: int
     side, height = 20, 10.0
     angle = 2 * np.degrees(np.arctan(np.sqrt(overlap) / 2 / height))
     places = [(x, y) for y in range(side) for x in range(side)]
-    views = [
-        {**view((x, y, height), (0, 0, -1)), "up": (0, 1, 0), "fov_y_degrees": angle} for x, y in places
-    ]
+    views = [{**view((x, y, height), (0, 0, -1)), "up": (0, 1, 0), "fov_y_degrees": angle} for x, y in places]
     random = np.random.default_rng(4)
     field = np.pad(random.uniform(2.5, side - 3.5, (300, 2)), ((0, 0), (0, 1)))
     streaks = random.uniform(200, 300, (60, 3))

@@ -129,7 +129,8 @@ def test_newer_scene_is_shown_where_the_first_could_not_be_loaded(tmp_path: Path
         Worker.prototype.postMessage = function (message, ...others) {
             post.call(this, message, ...others);
             if (!message.load?.endsWith("gone.ply")) return;
-            box.dispatchEvent(new CustomEvent("scene", { detail: { scene: "/files/scene.ply", count: "newer" } }));
+            const detail = { scene: "/files/scene.ply", count: "newer" };
+            box.dispatchEvent(new CustomEvent("scene", { detail }));
         };
         """,
         scene="/files/gone.ply",
@@ -169,8 +170,13 @@ def test_scene_comes_back_with_the_graphics_of_the_device(tmp_path: Path) -> Non
         canvas.getContext = (kind, options) => original(kind, { ...options, preserveDrawingBuffer: true });
         """,
     )
-    assert found["lost"] == [False, "The graphics of this device have stopped; the scene comes back with them."]
-    assert found["veil"] and found["before"] > 5 and found["after"] == pytest.approx(found["before"], rel=0.02)
+    assert found["lost"] == [
+        False,
+        "The graphics of this device have stopped; the scene comes back with them.",
+    ]
+    assert (
+        found["veil"] and found["before"] > 5 and found["after"] == pytest.approx(found["before"], rel=0.02)
+    )
 
 
 def test_photograph_can_be_chosen_again_after_its_place_was_left(tmp_path: Path) -> None:

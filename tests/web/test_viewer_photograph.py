@@ -17,15 +17,21 @@ STATIC = Path(service_web.__file__).parent / "static"
 PAGE = """<!doctype html>
 <html><body>
 <div id="box" data-photographs="/files/"><div><img class="photo" hidden></div>
-<select class="photo-mode with-photographs"><option value=""><option value="over"><option value="corner"></select>
+<select class="photo-mode with-photographs">
+<option value=""><option value="over"><option value="corner"></select>
 <input class="photo-share" type="range"></div><p id="place"></p>
 <script type="module">
 import { PerspectiveCamera, Vector3 } from "/files/vendor/three.js";
 import { Photograph } from "/files/viewer/photograph.js";
 const job = JOB, box = document.getElementById("box"), image = box.querySelector("img");
 const photograph = new Photograph(box, document.getElementById("place"));
-const choose = (mode) => { photograph.mode.value = mode; photograph.mode.dispatchEvent(new Event("change")); };
-const after = (kind) => new Promise((resolve) => image.addEventListener(kind, () => setTimeout(resolve), { once: true }));
+const choose = (mode) => {
+    photograph.mode.value = mode;
+    photograph.mode.dispatchEvent(new Event("change"));
+};
+const after = (kind) => new Promise((resolve) => {
+    image.addEventListener(kind, () => setTimeout(resolve), { once: true });
+});
 const view = (name, more = {}) => ({ name, fov_y_degrees: 40, aspect: 1, up: [0, 1, 0], ...more });
 window.result = (async () => { BODY })();
 </script></body></html>
@@ -81,7 +87,7 @@ def test_photograph_that_cannot_be_shown_stays_away(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("degrees", [0, 90, -35, 180])
 def test_photograph_of_a_turned_camera_lies_turned(degrees: int, tmp_path: Path) -> None:
-    """What was at the photograph's top is in its direction in the view, whose own up stays that of the scene."""
+    """The photograph's top is in its direction in the view, whose own up stays that of the scene."""
     angle = np.radians(degrees)
     found = in_page(
         """
