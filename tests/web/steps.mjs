@@ -348,8 +348,9 @@ const steps = {
         found.photograph = await page.evaluate(async () => {
             const image = document.querySelector("#viewer .photo");
             await image.decode();
-            const box = image.getBoundingClientRect(), screen = image.parentElement.getBoundingClientRect();
-            return { alt: image.alt, width: image.naturalWidth, ratio: box.width / box.height, covers: box.height / screen.height };
+            // As the page lays it out, before it is turned as its camera was.
+            const { offsetWidth: width, offsetHeight: height } = image;
+            return { alt: image.alt, width: image.naturalWidth, ratio: width / height, covers: height / image.parentElement.clientHeight };
         });
         await page.waitForTimeout(500);
         await shot(page, "live_photograph");
