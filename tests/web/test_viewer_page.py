@@ -198,3 +198,16 @@ def test_photograph_can_be_chosen_again_after_its_place_was_left(tmp_path: Path)
         THREE,
     )
     assert found == ["1", ""]
+
+
+def test_places_of_photographs_that_cannot_be_loaded_are_told(tmp_path: Path) -> None:
+    """Once the service was only busy; else the scene is shown without them, and that is said."""
+    busy = """
+    const original = window.fetch;
+    let left = 1;
+    window.fetch = async (address) => (left-- > 0 ? new Response("{}", { status: 503 }) : original(address));
+    """
+    look = READY + 'return [find(".views").options.length, place()];'
+    assert in_viewer(look, tmp_path, THREE, busy)[0] == 4
+    words = "The places of the photographs could not be loaded."
+    assert in_viewer(look, tmp_path, THREE, cameras="/files/gone.json") == [1, words]

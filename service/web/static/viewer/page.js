@@ -16,6 +16,7 @@ import { LoadingViewer } from "./loading_viewer.js";
 
 const MAX_PIXEL_RATIO = 2;
 const REST_MS = 150;
+const CAMERA_TRIES = 3, CAMERA_PAUSE_MS = 500;
 const BACKGROUNDS = { black: [0, 0, 0], white: [1, 1, 1] };
 
 class Viewer extends LoadingViewer {
@@ -173,12 +174,15 @@ class Viewer extends LoadingViewer {
     }
 
     async loadCameras() {
-        try {
-            const response = await fetch(this.box.dataset.cameras);
-            return response.ok ? await response.json() : { views: [] };
-        } catch {
-            return { views: [] };
+        for (let left = CAMERA_TRIES; left > 0; left -= 1) {
+            try {
+                const response = await fetch(this.box.dataset.cameras);
+                if (response.ok) return await response.json();
+                if (response.status < 500 && response.status !== 429) break;
+            } catch { /* the connection may be back soon */ }
+            await new Promise((resolve) => setTimeout(resolve, CAMERA_PAUSE_MS));
         }
+        return { views: [], isLost: true };
     }
 
     setUp(scene, cameras) {
@@ -204,7 +208,7 @@ class Viewer extends LoadingViewer {
         this.marks = new Marks(this);
         this.setScene(scene, cameras);
         this.do("reset");
-        this.place.textContent = "";
+        this.place.textContent = cameras.isLost ? "The places of the photographs could not be loaded." : "";
         this.followLink();
         addEventListener("hashchange", () => this.followLink());
         const panel = document.getElementById("edit");
