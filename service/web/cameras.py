@@ -21,11 +21,16 @@ MAX_CAMERAS = 20_000
 MAX_VIEWS = 400
 """Most views that the viewer offers; more are thinned evenly."""
 _MAX_NAME_BYTES = 4096
-_PARAMETER_COUNTS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 10: 12}
+_PARAMETER_COUNTS = {
+    0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 10: 12, 11: 16, 12: 4, 13: 5, 14: 3, 15: 4,
+    16: 6, 17: 2,
+}  # fmt: skip
 """Number of parameters by COLMAP's camera model number."""
-_SINGLE_FOCAL_MODELS = frozenset({0, 2, 3, 8, 9})
+_SINGLE_FOCAL_MODELS = frozenset({0, 2, 3, 8, 9, 12, 14})
+_PANORAMA_MODEL, _PANORAMA_NAME = 17, "EQUIRECTANGULAR"
 _SINGLE_FOCAL_NAMES = frozenset(
     {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+    | {"SIMPLE_DIVISION", "SIMPLE_FISHEYE"}
 )
 
 
@@ -85,21 +90,14 @@ def read_view_poses(content: Mapping[str, Any]) -> list[PhotographPose]:
 
 def _pose_of_view(view: Mapping[str, Any], cameras: Sequence[Mapping[str, Any]]) -> PhotographPose | None:
     camera = cameras[view["camera"]]
-    is_panorama = camera["model"] == _PANORAMA
-    if is_panorama:
-        intrinsics: _Intrinsics | None = _PANORAMA_MIDDLE
-    else:
-        fx, fy = _focal_lengths(camera["params"], camera["model"] in _SINGLE_FOCAL_NAMES)
-        intrinsics = _intrinsics_from_focal(camera["width_px"], camera["height_px"], fx, fy)
+    intrinsics = _named_intrinsics(camera["model"], camera["width_px"], camera["height_px"], camera["params"])
     rotation = np.array(view["rotation_cam_from_world"], np.float64)
     translation = np.array(view["translation_cam_from_world"], np.float64)
     if intrinsics is None or not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
         return None
     # A point of the world is R p + t in the camera, so that the camera's own place is -R' t.
     centre = -rotation.T @ translation
-    return PhotographPose(
-        str(view["name"]), rotation, centre, intrinsics.fov_y_degrees, intrinsics.aspect, is_panorama
-    )
+    return _photograph_pose(str(view["name"]), rotation, centre, intrinsics)
 
 
 def viewer_cameras(
@@ -190,13 +188,22 @@ class _Intrinsics:
 
     fov_y_degrees: float
     aspect: float
+    is_panorama: bool = False
 
 
-_PANORAMA = "EQUIRECTANGULAR"
-_PANORAMA_MIDDLE = _Intrinsics(60.0, 1.5)
+_PANORAMA_MIDDLE = _Intrinsics(60.0, 1.5, is_panorama=True)
 """What the viewer shows of a panorama where it goes to its place."""
 _ImageRecord = tuple[list[float], int, str]
 """Seven numbers of the pose, the camera's id, the name."""
+
+
+def _named_intrinsics(
+    model: str, width: float, height: float, parameters: Sequence[float]
+) -> _Intrinsics | None:
+    """Return the intrinsics of a camera whose model is named; None where a number is invalid."""
+    if model == _PANORAMA_NAME:
+        return _PANORAMA_MIDDLE
+    return _intrinsics_from_focal(width, height, *_focal_lengths(parameters, model in _SINGLE_FOCAL_NAMES))
 
 
 def _focal_lengths(parameters: Sequence[float], has_one: bool) -> tuple[float, float]:
@@ -227,7 +234,16 @@ def _pose_of_image(record: _ImageRecord, intrinsics: dict[int, _Intrinsics]) -> 
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-    return PhotographPose(name, rotation, -rotation.T @ translation, camera.fov_y_degrees, camera.aspect)
+    return _photograph_pose(name, rotation, -rotation.T @ translation, camera)
+
+
+def _photograph_pose(
+    name: str,
+    rotation: Float64[np.ndarray, "3 3"],
+    centre: Float64[np.ndarray, "3"],
+    camera: _Intrinsics,
+) -> PhotographPose:
+    return PhotographPose(name, rotation, centre, camera.fov_y_degrees, camera.aspect, camera.is_panorama)
 
 
 def _read_cameras_bin(file: IO[bytes]) -> dict[int, _Intrinsics]:
@@ -240,6 +256,9 @@ def _read_cameras_bin(file: IO[bytes]) -> dict[int, _Intrinsics]:
         if model not in _PARAMETER_COUNTS:
             raise ValueError(f"unsupported COLMAP camera model {model}")
         parameters = _unpack(file, f"<{_PARAMETER_COUNTS[model]}d")
+        if model == _PANORAMA_MODEL:
+            intrinsics[camera_id] = _PANORAMA_MIDDLE
+            continue
         found = _intrinsics_from_focal(
             width, height, *_focal_lengths(parameters, model in _SINGLE_FOCAL_MODELS)
         )
@@ -274,8 +293,7 @@ def _read_cameras_txt(file: IO[bytes]) -> dict[int, _Intrinsics]:
         if not words:
             continue
         parameters = [float(word) for word in words[4:]]
-        focal_lengths = _focal_lengths(parameters, words[1] in _SINGLE_FOCAL_NAMES)
-        found = _intrinsics_from_focal(float(words[2]), float(words[3]), *focal_lengths)
+        found = _named_intrinsics(words[1], float(words[2]), float(words[3]), parameters)
         if found is not None:
             intrinsics[int(words[0])] = found
         _check_record_count(len(intrinsics))
