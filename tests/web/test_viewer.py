@@ -52,6 +52,7 @@ window.result = (async () => {
   if (job.light) {
     view.setLight(readHdr(await (await fetch("/files/light.hdr")).arrayBuffer()));
     view.lighting.turn(job.light.up, job.light.degrees);
+    await view.setScene(scene, job.q); // as where the device's graphics were gone: it keeps the light
   }
   const camera = new PerspectiveCamera(job.fov, 1, 0.01, 100);
   camera.matrixAutoUpdate = false;
