@@ -23,7 +23,7 @@ from octasplat.workers.queue.block_jobs import (
 )
 from octasplat.workers.queue.fair_share import choose_job
 from octasplat.workers.queue.job_results import ResultFile
-from octasplat.workers.queue.jobs import create_job, list_jobs, retry_job
+from octasplat.workers.queue.jobs import create_job, delete_job, list_jobs, lock_blocks, retry_job
 from octasplat.workers.queue.recovery import StalledAttempts, recover_stalled_jobs
 from octasplat.workers.queue.storage_leases import storage_lease
 from octasplat.workers.queue.usage_figures import running_by_queue
@@ -240,3 +240,41 @@ async def test_cancelling_and_succeeding_at_once_end_somehow(conninfo: str, fold
 
             await asyncio.gather(cancel(), *(attempt.succeed([], job_queue=SLIPS) for attempt in attempts))
             assert (await settle(pool, root.id)).state in ("canceled", "queued")
+
+
+@pytest.mark.parametrize("way", ["plan", "lost", "retry", "delete"])
+async def test_blocks_are_locked_before_the_job_that_waits_for_them(
+    conninfo: str, folder: Path, way: str
+) -> None:
+    """As whoever cancels the job does; two that take both in other orders would wait for each other."""
+    async with open_pool(conninfo, max_size=8) as pool:
+        root = await start(pool, folder, await claimed(pool))
+        if way in ("plan", "lost"):
+            for block in await children(pool, root.id):
+                results = [ResultFile("blocks/best.npz", str(block.options["number"]) * 64, 1, "x")]
+                await (await claimed(pool, block)).succeed(results, job_queue=SLIPS)
+            merge = await claimed(pool, await fetched(pool, root.id))
+        else:
+            async with pool.connection() as connection:
+                await cancel_job(connection, SLIPS, root.id)
+
+        async def change() -> None:
+            if way == "plan":
+                await start(pool, folder, merge)
+            elif way == "lost":
+                await merge.drop_lost_blocks({"2" * 64})
+            else:
+                async with pool.connection() as connection:
+                    if way == "retry":
+                        await retry_job(connection, SLIPS, root.id, from_start=True)
+                    else:
+                        await delete_job(connection, root.id)
+
+        async with pool.connection() as connection, connection.transaction():
+            await lock_blocks(connection, root.id)
+            changing = asyncio.create_task(change())
+            await asyncio.sleep(0.5)
+            assert not changing.done()
+            found = await connection.execute("SELECT id FROM jobs WHERE id = %s FOR UPDATE NOWAIT", [root.id])
+            assert await found.fetchone() is not None
+        await changing

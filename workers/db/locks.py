@@ -5,7 +5,7 @@
    those that mark unused ones.
 3. The lock of an owner (advisory): the owner's usage is compared with the quota and counted.
 4. The lock of a kind of task on datasets (advisory): tasks of an owner are counted and one is claimed.
-5. Rows: jobs, then datasets, then whatever belongs to them.
+5. Rows: jobs, blocks before the job that waits for them, then datasets, then whatever belongs to them.
 
 So no transaction that has locked a row of a job or a dataset waits for an advisory lock: a heartbeat waits
 for its row only as long as a few statements take. The storage, and anything else on the network, is not

@@ -27,7 +27,7 @@ from octasplat.workers.queue.block_jobs import (
 )
 from octasplat.workers.queue.job_endings import MAX_RECOVERIES, count_requeues, end_job, recover_attempt
 from octasplat.workers.queue.job_results import ResultFile, replace_artifacts, result_digests
-from octasplat.workers.queue.jobs import get_job, requeue_job
+from octasplat.workers.queue.jobs import get_job, lock_blocks, requeue_job
 from octasplat.workers.queue.protocol import JobQueue
 from octasplat.workers.queue.storage_leases import StorageLease
 
@@ -210,7 +210,10 @@ class Attempt:
             QuotaExceededError: the job's owner may not store as much.
         """
         contents = {file["sha256"] for file in checkpoint["files"]}
-        async with self._fenced_transaction(lease, contents, changes_usage=True) as (connection, job):
+        async with self._fenced_transaction(lease, contents, changes_usage=True, with_blocks=True) as (
+            connection,
+            job,
+        ):
             if job.state == "canceling":
                 await end_job(connection, job, "canceled", None)
                 return
@@ -230,7 +233,7 @@ class Attempt:
         """
         if not lost:
             return
-        async with self._fenced_transaction(changes_usage=True) as (connection, job):
+        async with self._fenced_transaction(changes_usage=True, with_blocks=True) as (connection, job):
             await drop_lost_blocks(connection, job, lost)
 
     async def fail(
@@ -350,6 +353,7 @@ class Attempt:
         contents: Collection[str] = (),
         *,
         changes_usage: bool = False,
+        with_blocks: bool = False,
     ) -> AsyncIterator[tuple[Connection, Job]]:
         """Yield a transaction that holds the job's lock, if the attempt is still the job's.
 
@@ -358,11 +362,14 @@ class Attempt:
             contents: their digests.
             changes_usage: whether it changes what the owner stores; the owner's lock is taken before the
                 job's, see :mod:`octasplat.workers.db.locks`.
+            with_blocks: whether it changes the blocks of the job, too; these are locked before it.
         """
         named = _transaction(self.pool) if lease is None else lease.reference(contents)
         async with named as connection:
             if changes_usage:
                 await lock_owner(connection, self.job.owner)
+            if with_blocks:
+                await lock_blocks(connection, self.job.id)
             job = await get_job(connection, self.job.id, lock=True)
             self._check_fence(job)
             assert job is not None

@@ -19,12 +19,11 @@ from octasplat.workers.db.connections import Connection, fetch_all
 from octasplat.workers.db.errors import ConflictError, NotFoundError
 from octasplat.workers.db.events_and_logs import add_event, add_log_lines
 from octasplat.workers.db.live_scenes import get_shown_scene
-from octasplat.workers.db.locks import about_to_lock_jobs
 from octasplat.workers.db.postgres_text import as_json
 from octasplat.workers.db.rows import Job
 from octasplat.workers.queue.job_endings import end_job
 from octasplat.workers.queue.job_results import replace_artifacts
-from octasplat.workers.queue.jobs import NewJob, create_jobs, get_job, requeue_job
+from octasplat.workers.queue.jobs import NewJob, create_jobs, get_job, lock_blocks, requeue_job
 from octasplat.workers.queue.protocol import JobQueue
 from octasplat.workers.storage.errors import BlobNotFoundError
 from octasplat.workers.storage.trees import TreeFile
@@ -60,7 +59,7 @@ async def start_blocks(
     first_steps: int,
     total_steps: int,
 ) -> None:
-    """Queue the blocks of a job, which waits for them from now on; the caller holds the job's lock.
+    """Queue the blocks of a job, which waits for them from now on; the caller has locked both.
 
     Blocks that an earlier attempt has queued are kept if their options are the same: those that succeeded
     are not trained again.
@@ -152,7 +151,7 @@ async def settle_root(connection: Connection, job_queue: JobQueue, root_id: uuid
     if not await unsettled_roots(connection, root_id):
         return
     async with connection.transaction():
-        children = await _lock_blocks(connection, root_id)
+        children = await lock_blocks(connection, root_id)
         root = await get_job(connection, root_id, lock=True)
         if root is None or not root.waits_for_blocks:
             return
@@ -222,7 +221,7 @@ async def files_from_others(connection: Connection, job: Job) -> list[TreeFile]:
 
 
 async def drop_lost_blocks(connection: Connection, root: Job, lost: Collection[str]) -> None:
-    """Let the blocks be trained again whose results the store has lost; the caller holds the job's lock.
+    """Let the blocks be trained again whose results the store has lost; the caller has locked all of them.
 
     They are over without success afterwards, and queued when the job that is being merged plans its blocks.
 
@@ -236,7 +235,7 @@ async def drop_lost_blocks(connection: Connection, root: Job, lost: Collection[s
     """
     query = """
         SELECT {} FROM jobs WHERE root_id = %s AND state = 'succeeded' AND EXISTS (
-            SELECT FROM artifacts WHERE job_id = jobs.id AND sha256 = ANY(%s)) ORDER BY id FOR UPDATE
+            SELECT FROM artifacts WHERE job_id = jobs.id AND sha256 = ANY(%s)) ORDER BY id
         """
     for child in await fetch_all(connection, Job, query, [root.id, list(lost)]):
         number = int(child.options["number"])
@@ -278,7 +277,7 @@ async def cancel_job(connection: Connection, job_queue: JobQueue, job_id: uuid.U
         NotFoundError: there is no such job.
     """
     async with connection.transaction():
-        await _lock_blocks(connection, job_id)
+        await lock_blocks(connection, job_id)
         job = await get_job(connection, job_id, lock=True)
         if job is None:
             raise NotFoundError("job")
@@ -331,12 +330,6 @@ async def _continue_root(connection: Connection, job_queue: JobQueue, root: Job)
         "UPDATE jobs SET continuations = continuations || %s WHERE id = %s", [[root.attempt + 1], root.id]
     )
     await requeue_job(connection, job_queue, root)
-
-
-async def _lock_blocks(connection: Connection, root_id: uuid.UUID) -> list[Job]:
-    await about_to_lock_jobs(connection)
-    query = "SELECT {} FROM jobs WHERE root_id = %s ORDER BY id FOR UPDATE"
-    return await fetch_all(connection, Job, query, [root_id])
 
 
 async def _count_needs(connection: Connection, job_id: uuid.UUID) -> int:

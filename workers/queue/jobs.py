@@ -202,6 +202,13 @@ async def list_jobs(
     )
 
 
+async def lock_blocks(connection: Connection, root_id: uuid.UUID) -> list[Job]:
+    """Lock the blocks of a job, which comes before its own lock; return them by their ids."""
+    await about_to_lock_jobs(connection)
+    query = "SELECT {} FROM jobs WHERE root_id = %s ORDER BY id FOR UPDATE"
+    return await fetch_all(connection, Job, query, [root_id])
+
+
 async def retry_job(
     connection: Connection,
     job_queue: JobQueue,
@@ -226,6 +233,7 @@ async def retry_job(
     async with connection.transaction():
         # The owner's lock comes before the row's, see workers.db.locks.
         await lock_owner(connection, (await _get_job_or_raise(connection, job_id)).owner)
+        await lock_blocks(connection, job_id)
         job = await _get_job_or_raise(connection, job_id, lock=True)
         job.refuse_block()
         if job.state not in ("failed", "canceled"):
@@ -360,6 +368,7 @@ async def delete_job(connection: Connection, job_id: uuid.UUID) -> None:
     """
     async with connection.transaction():
         await lock_owner(connection, (await _get_job_or_raise(connection, job_id)).owner)
+        await lock_blocks(connection, job_id)  # which go with it
         job = await _get_job_or_raise(connection, job_id, lock=True)
         job.refuse_block()
         if not job.is_over:
