@@ -1,5 +1,10 @@
 """Paths of another kind than a command expects, and names that are no text, in the commands that read them."""
 
+import json
+import os
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -16,3 +21,41 @@ def test_dataset_that_is_no_folder_is_refused_in_a_sentence(octasplat, tmp_path:
         f"Error: {tmp_path / name} is not a folder; name the folder that holds the photographs.\n"
     )
     assert not (tmp_path / "run").exists()
+
+
+UNDECODABLE = os.fsdecode(b"\xff\xfe.ply")
+"""A name of bytes that are no UTF-8, as of files from other systems."""
+
+
+@pytest.fixture
+def undecodable(run, tmp_path: Path) -> Path:
+    """A copy of a scene under such a name."""
+    path = tmp_path / UNDECODABLE
+    shutil.copy(run.output / "scene.ply", path)
+    return path
+
+
+def test_name_that_is_no_text_is_written_and_replaced(octasplat, undecodable: Path, tmp_path: Path) -> None:
+    output = tmp_path / os.fsdecode(b"clean\xff.ply")
+    for _ in range(2):  # the second time it is known as ours
+        result = octasplat("clean", undecodable, "-o", output, "--quiet")
+        assert result.exit_code == 0, result.output
+    output.write_bytes(b"changed")
+    assert octasplat("clean", undecodable, "-o", output, "--quiet").exit_code == 1
+
+
+def test_name_that_is_no_text_is_escaped_in_json(octasplat, undecodable: Path) -> None:
+    result = octasplat("info", undecodable, "--json")
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["source"] == str(undecodable)
+
+
+def test_name_that_output_cannot_show_is_escaped(undecodable: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "octasplat", "info", undecodable],
+        env={**os.environ, "PYTHONIOENCODING": "utf-8:strict"},
+        capture_output=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert rb"\udcff\udcfe.ply: " in done.stdout

@@ -4,6 +4,7 @@ Everything heavy is imported by the commands when they run, so that ``--help`` a
 """
 
 import errno
+import io
 import os
 import sys
 import traceback
@@ -213,7 +214,14 @@ def _show_warning(
         (file or sys.stderr).write(warnings.formatwarning(message, category, filename, lineno, line))
 
 
+def _show_any_text() -> None:
+    """Let standard output show what its encoding lacks, such as the name of a file, as escapes."""
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")
+
+
 def main() -> None:
     """Run the command line; warnings for users are one sentence."""
+    _show_any_text()
     warnings.showwarning = _show_warning
     cli(prog_name="octasplat")

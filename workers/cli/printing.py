@@ -1,13 +1,14 @@
 """What commands print: text for people, JSON for programs, or nothing but warnings."""
 
 import functools
+import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, TypeVar
 
 import click
-from pydantic_core import to_json
+from pydantic_core import PydanticSerializationError, to_json, to_jsonable_python
 
 from octasplat.engine.operations.base import Result
 
@@ -65,8 +66,15 @@ def output_options(command: F) -> F:
 
 
 def json_text(value: Any) -> str:
-    """Return a value as JSON; numbers that are not finite become null, as JSON has none."""
-    return to_json(value, indent=2, inf_nan_mode="null", fallback=_plain_value).decode()
+    """Return a value as JSON; numbers that are not finite become null, as JSON has none.
+
+    Bytes of a file's name that are no text are written as escapes such as ``\\udcff``, as Python has them.
+    """
+    try:
+        return to_json(value, indent=2, inf_nan_mode="null", fallback=_plain_value).decode()
+    except PydanticSerializationError:
+        plain = to_jsonable_python(value, inf_nan_mode="null", fallback=_plain_value)
+        return json.dumps(plain, indent=2)
 
 
 def _plain_value(value: Any) -> Any:
