@@ -214,6 +214,17 @@ def _show_warning(
         (file or sys.stderr).write(warnings.formatwarning(message, category, filename, lineno, line))
 
 
+def _open_missing_streams() -> None:
+    """Let standard streams that the caller has closed lead nowhere.
+
+    Else the next file that is opened takes the place of one, and native libraries print into it.
+    """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            # the lowest descriptor that is free, which is the closed one
+            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115 (open until the end)
+
+
 def _show_any_text() -> None:
     """Let standard output show what its encoding lacks, such as the name of a file, as escapes."""
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
@@ -222,6 +233,7 @@ def _show_any_text() -> None:
 
 def main() -> None:
     """Run the command line; warnings for users are one sentence."""
+    _open_missing_streams()
     _show_any_text()
     warnings.showwarning = _show_warning
     cli(prog_name="octasplat")

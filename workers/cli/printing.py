@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import click
 from pydantic_core import PydanticSerializationError, to_json, to_jsonable_python
 
+from octasplat.engine.core.errors import OutputError
 from octasplat.engine.operations.base import Result
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -39,17 +40,34 @@ class Printer:
             value: a result, a model, or JSON values.
             lines: the same for people.
             quiet_lines: what is left of it with ``--quiet``.
+
+        Raises:
+            OutputError: standard output cannot be written.
         """
         if self.as_json:
-            click.echo(json_text(value.facts() if isinstance(value, Result) else value))
+            _echo(json_text(value.facts() if isinstance(value, Result) else value))
             return
         for line in quiet_lines if self.quiet else lines:
-            click.echo(line)
+            _echo(line)
 
     def note(self, text: str) -> None:
         """Print a sentence beside the value, unless the command is quiet or writes JSON."""
         if not self.hides_progress:
-            click.echo(text)
+            _echo(text)
+
+
+def _echo(text: str) -> None:
+    """Print a line on standard output.
+
+    Raises:
+        OutputError: standard output cannot be written, as where it is a file and the disk is full.
+    """
+    try:
+        click.echo(text)
+    except BrokenPipeError:  # whoever read the output has left
+        raise
+    except OSError as error:
+        raise OutputError(f"Standard output cannot be written ({error.strerror or error}).") from None
 
 
 def output_options(command: F) -> F:
