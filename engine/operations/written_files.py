@@ -56,13 +56,16 @@ def check_targets(
 
     Raises:
         ConfigError: one of them is read.
-        OutputError: one of them is there and somebody else's.
+        OutputError: one of them is there and somebody else's, or in the place of its folder is a file.
     """
     checked = tuple(dict.fromkeys(targets))  # each once, in order
     read = _Read([path for path in inputs if path is not None])
     for target in checked:
         if target.is_dir():
             raise OutputError(f"{target} is a folder; name a file.")
+        above = next((folder for folder in target.parents if folder.exists()), None)
+        if above is not None and not above.is_dir():
+            raise OutputError(f"{target} cannot be written, as {above} is a file; choose another -o.")
         if (folder := read.place_of(target)) is not None:
             raise ConfigError(f"{target}: would overwrite what the command reads{folder}; choose another -o.")
     there = [target for target in checked if target.exists()]
