@@ -251,8 +251,10 @@ def scene_folder(request: ReconstructRequest) -> Path:
     """Return the folder of the photographs; that of a video's frames is beside the output."""
     from octasplat.engine.dataset.video_frames import is_video
 
-    source = request.source
-    return request.output.with_name(f"{request.output.name}-frames") if is_video(source) else source
+    source, output = request.source, request.output
+    if output.name in ("", ".."):  # as of ".", which has no name of its own
+        output = output.resolve()
+    return output.with_name(f"{output.name}-frames") if is_video(source) else source
 
 
 def _take_frames(request: ReconstructRequest, folder: Path, progress: EventListener) -> None:
