@@ -18,6 +18,7 @@ from pathlib import Path
 import platformdirs
 
 from octasplat.engine.core.errors import ConfigError, OutputError
+from octasplat.engine.core.portable_names import is_text
 from octasplat.engine.core.scene_layout import SCENE_FOLDERS
 from octasplat.engine.dataset.results_among import is_run_folder
 
@@ -143,11 +144,7 @@ def _kind_of_verb(verb: str) -> str:
 def _database_key(file: Path) -> str | bytes:
     """Return the place of a file as text, or as bytes where its name is no text, which SQLite refuses."""
     place = str(file.resolve())
-    try:
-        place.encode()
-    except UnicodeEncodeError:
-        return os.fsencode(place)
-    return place
+    return place if is_text(place) else os.fsencode(place)
 
 
 def _is_ours(file: Path, known: _UNCHANGED_SINCE) -> bool:

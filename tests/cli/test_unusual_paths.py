@@ -1,4 +1,4 @@
-"""Paths of another kind than a command expects, and names that are no text, in the commands that read them."""
+"""Paths of another kind than a command expects, and names that are no text."""
 
 import json
 import os
@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 
 import pytest
+
+from octasplat.engine.operations.reconstruct import ReconstructRequest, scene_folder
 
 
 @pytest.mark.parametrize("command", ["estimate", "plan", "reconstruct"])
@@ -59,3 +61,30 @@ def test_name_that_output_cannot_show_is_escaped(undecodable: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert rb"\udcff\udcfe.ply: " in done.stdout
+
+
+def test_pictures_whose_paths_are_no_text_are_refused_in_a_sentence(octasplat, run, tmp_path: Path) -> None:
+    output = tmp_path / os.fsdecode(b"run\xff")
+    refused = octasplat("reconstruct", run.scene, "-o", output)
+    assert refused.exit_code == 1 and "the path is no text" in refused.stderr, refused.output
+    assert not output.exists()
+
+    camera = ("--camera", "0", "0", "-4", "--width", "16", "--height", "16")
+    image = octasplat("render", run.output, *camera, "-o", tmp_path / os.fsdecode(b"view\xff.png"))
+    assert image.exit_code == 1 and "its path is no text; choose another" in image.stderr, image.output
+
+    photographs = tmp_path / os.fsdecode(b"scene\xff")
+    shutil.copytree(run.scene, photographs)
+    read = octasplat("reconstruct", photographs, "-o", tmp_path / "other")
+    assert read.exit_code == 1 and "its path is no text; rename it" in read.stderr, read.output
+
+
+@pytest.mark.parametrize("name", [".", "inner/.."])
+def test_frames_of_a_video_are_beside_the_folder_that_has_no_name_of_its_own(
+    tmp_path: Path, monkeypatch, name: str
+) -> None:
+    (tmp_path / "here/inner").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "here")
+    Path("film.mp4").touch()
+    request = ReconstructRequest(source=Path("film.mp4"), output=Path(name))
+    assert scene_folder(request) == tmp_path / "here-frames"

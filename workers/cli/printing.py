@@ -84,9 +84,9 @@ def output_options(command: F) -> F:
 
 
 def json_text(value: Any) -> str:
-    """Return a value as JSON; numbers that are not finite become null, as JSON has none.
+    r"""Return a value as JSON; numbers that are not finite become null, as JSON has none.
 
-    Bytes of a file's name that are no text are written as escapes such as ``\\udcff``, as Python has them.
+    Bytes of a file's name that are no text are written as escapes such as ``\udcff``, as Python has them.
     """
     try:
         return to_json(value, indent=2, inf_nan_mode="null", fallback=_plain_value).decode()

@@ -8,7 +8,10 @@ from octasplat.workers.cli.service_options import connected, server_option
 
 @click.command("open", short_help="Sign a browser in to the service.")
 @click.option(
-    "--print", "print_link", is_flag=True, help="Only print the link.  [default: without a display or browser]"
+    "--print",
+    "print_link",
+    is_flag=True,
+    help="Only print the link.  [default: without a display or browser]",
 )
 @server_option
 @output_options
