@@ -128,6 +128,7 @@ def finish(scene: Path, run: Path, config: ReconstructionConfig, threads: int) -
     assert process.exitcode == 0
 
 
+@pytest.mark.exhaustive
 def test_killed_while_training_again_and_again(scene: Path, whole_run: Path, tmp_path: Path) -> None:
     moments = random.Random(11)
     run = tmp_path / "run"

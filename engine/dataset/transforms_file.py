@@ -82,6 +82,7 @@ class _File(_Lens):
 
 _LENS_KEYS = tuple(_Lens.model_fields)
 _SIZE_KEYS = frozenset({"w", "h"})
+_FOCAL_KEYS = frozenset({"fl_x", "fl_y", "camera_angle_x", "camera_angle_y"})
 
 
 @dataclass(frozen=True)
@@ -199,8 +200,8 @@ def _lens_values(file: _File, frame: _Frame) -> dict[str, Any]:
     """Return the values of a frame's lens that are given, for it or for all frames."""
     own = {key: value for key in _LENS_KEYS if (value := getattr(frame, key)) is not None}
     common = {key: value for key in _LENS_KEYS if (value := getattr(file, key)) is not None}
-    if own.keys() & {"camera_angle_x", "camera_angle_y"}:  # instead of the focal lengths of the file
-        common = {key: value for key, value in common.items() if key not in ("fl_x", "fl_y")}
+    if own.keys() & _FOCAL_KEYS:  # one lens: nothing of another one's focal length belongs to it
+        common = {key: value for key, value in common.items() if key not in _FOCAL_KEYS}
     return common | own
 
 

@@ -91,7 +91,7 @@ def training_photographs(
     instead = "Colors are those that the scene shows, not those of photographs"
     try:
         folder = photographs_folder(source, dataset or copy)
-        model, _ = model_of_photographs(source, folder, config)
+        model_folder, model = model_of_photographs(source, folder, config)
     except DatasetError as error:
         progress(Noted(f"{instead}. {error}"))
         return ()
@@ -99,7 +99,13 @@ def training_photographs(
         # before anything is decoded
         check_views = partial(_check_same_poses, source, folder)
         opened = open_run_dataset(
-            folder, source, config, threads, progress, model_folder=model, check_views=check_views
+            folder,
+            source,
+            config.model_copy(update={"model": model}),
+            threads,
+            progress,
+            model_folder=model_folder,
+            check_views=check_views,
         )
     except DatasetError as error:
         if dataset is not None:  # those that were named must fit

@@ -7,7 +7,7 @@ left out.
 
 import io
 import struct
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import IO, Any
@@ -19,13 +19,18 @@ from octasplat.engine.render.upright import estimate_up
 
 MAX_CAMERAS = 20_000
 MAX_VIEWS = 400
-"""Most views that the viewer offers; of more, every N-th."""
+"""Most views that the viewer offers; more are thinned evenly."""
 _MAX_NAME_BYTES = 4096
-_PARAMETER_COUNTS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 10: 12}
+_PARAMETER_COUNTS = {
+    0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 10: 12, 11: 16, 12: 4, 13: 5, 14: 3, 15: 4,
+    16: 6, 17: 2,
+}  # fmt: skip
 """Number of parameters by COLMAP's camera model number."""
-_SINGLE_FOCAL_MODELS = frozenset({0, 2, 3, 8, 9})
+_SINGLE_FOCAL_MODELS = frozenset({0, 2, 3, 8, 9, 12, 14})
+_PANORAMA_MODEL, _PANORAMA_NAME = 17, "EQUIRECTANGULAR"
 _SINGLE_FOCAL_NAMES = frozenset(
     {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+    | {"SIMPLE_DIVISION", "SIMPLE_FISHEYE"}
 )
 
 
@@ -42,7 +47,8 @@ class PhotographPose:
         rotation_cam_from_world: rows are the camera's right, down and forward in the world.
         centre_world: where it stood.
         fov_y_degrees: angle from top to bottom.
-        aspect: width over height.
+        aspect: width over height of what it shows, which is that of its pixels where these are square.
+        is_panorama: whether it shows all directions; angle and aspect are then those of its middle.
     """
 
     name: str
@@ -50,6 +56,7 @@ class PhotographPose:
     centre_world: Float64[np.ndarray, "3"]
     fov_y_degrees: float
     aspect: float
+    is_panorama: bool = False
 
 
 def read_poses(cameras: IO[bytes], images: IO[bytes], *, binary: bool) -> list[PhotographPose]:
@@ -83,15 +90,14 @@ def read_view_poses(content: Mapping[str, Any]) -> list[PhotographPose]:
 
 def _pose_of_view(view: Mapping[str, Any], cameras: Sequence[Mapping[str, Any]]) -> PhotographPose | None:
     camera = cameras[view["camera"]]
-    fy = float(camera["params"][0 if camera["model"] in _SINGLE_FOCAL_NAMES else 1])
-    intrinsics = _intrinsics_from_focal(camera["width_px"], camera["height_px"], fy)
+    intrinsics = _named_intrinsics(camera["model"], camera["width_px"], camera["height_px"], camera["params"])
     rotation = np.array(view["rotation_cam_from_world"], np.float64)
     translation = np.array(view["translation_cam_from_world"], np.float64)
     if intrinsics is None or not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
         return None
     # A point of the world is R p + t in the camera, so that the camera's own place is -R' t.
     centre = -rotation.T @ translation
-    return PhotographPose(str(view["name"]), rotation, centre, intrinsics.fov_y_degrees, intrinsics.aspect)
+    return _photograph_pose(str(view["name"]), rotation, centre, intrinsics)
 
 
 def viewer_cameras(
@@ -129,9 +135,7 @@ def viewer_cameras(
     if np.median(depth) < 0.1 * spread:
         target, depth = ahead, np.einsum("ij,ij->i", ahead - centres, forwards)
     held = set(held_out)
-    # Every N-th of many, and in any case those that are held out.
-    step = -(-len(poses) // MAX_VIEWS)
-    selected = [pose for k, pose in enumerate(poses) if k % step == 0 or pose.name in held][:MAX_VIEWS]
+    selected = _thinned(poses, held)
     return {
         "up": _round_values(up),
         "target": _round_values(target),
@@ -145,6 +149,7 @@ def viewer_cameras(
                 "up": _round_values(-pose.rotation_cam_from_world[1]),
                 "fov_y_degrees": round(pose.fov_y_degrees, 4),
                 "aspect": round(pose.aspect, 5),
+                "panorama": pose.is_panorama,
                 "held_out": pose.name in held,
                 "nearest_world": nearest_world.get(pose.name, 0.0),
             }
@@ -153,23 +158,65 @@ def viewer_cameras(
     }
 
 
+def _thinned(poses: Sequence[PhotographPose], held: Collection[str]) -> list[PhotographPose]:
+    """Return at most ``MAX_VIEWS`` from all over the photographs, in their order.
+
+    Held-out ones are kept before others, as far as they leave half of the places for these.
+    """
+    if len(poses) <= MAX_VIEWS:
+        return list(poses)
+    is_held = [pose.name in held for pose in poses]
+    held_rows = [k for k, hold in enumerate(is_held) if hold]
+    other_rows = [k for k, hold in enumerate(is_held) if not hold]
+    held_count = min(len(held_rows), max(MAX_VIEWS // 2, MAX_VIEWS - len(other_rows)))
+    rows = _evenly(held_rows, held_count) + _evenly(other_rows, MAX_VIEWS - held_count)
+    return [poses[k] for k in sorted(rows)]
+
+
+def _evenly(rows: list[int], count: int) -> list[int]:
+    """Return ``count`` of the rows, or all where there are fewer.
+
+    >>> _evenly([0, 1, 2, 3, 4, 5], 3)
+    [0, 2, 4]
+    """
+    return rows if len(rows) <= count else [rows[k * len(rows) // count] for k in range(count)]
+
+
 @dataclass(frozen=True)
 class _Intrinsics:
     """Intrinsics of a camera as the viewer takes them."""
 
     fov_y_degrees: float
     aspect: float
+    is_panorama: bool = False
 
 
+_PANORAMA_MIDDLE = _Intrinsics(60.0, 1.5, is_panorama=True)
+"""What the viewer shows of a panorama where it goes to its place."""
 _ImageRecord = tuple[list[float], int, str]
 """Seven numbers of the pose, the camera's id, the name."""
 
 
-def _intrinsics_from_focal(width: float, height: float, fy: float) -> _Intrinsics | None:
+def _named_intrinsics(
+    model: str, width: float, height: float, parameters: Sequence[float]
+) -> _Intrinsics | None:
+    """Return the intrinsics of a camera whose model is named; None where a number is invalid."""
+    if model == _PANORAMA_NAME:
+        return _PANORAMA_MIDDLE
+    return _intrinsics_from_focal(width, height, *_focal_lengths(parameters, model in _SINGLE_FOCAL_NAMES))
+
+
+def _focal_lengths(parameters: Sequence[float], has_one: bool) -> tuple[float, float]:
+    """Return both focal lengths of a camera, the first of its parameters."""
+    return float(parameters[0]), float(parameters[0 if has_one else 1])
+
+
+def _intrinsics_from_focal(width: float, height: float, fx: float, fy: float) -> _Intrinsics | None:
     """Return the vertical field of view and the aspect; None where a number is not positive and finite."""
-    if not (width > 0 and height > 0 and fy > 0 and np.isfinite([width, height, fy]).all()):
+    numbers = np.array([width, height, fx, fy], np.float64)
+    if not ((numbers > 0).all() and np.isfinite(numbers).all()):
         return None
-    return _Intrinsics(float(np.degrees(2 * np.arctan(height / (2 * fy)))), width / height)
+    return _Intrinsics(float(np.degrees(2 * np.arctan(height / (2 * fy)))), width * fy / (height * fx))
 
 
 def _pose_of_image(record: _ImageRecord, intrinsics: dict[int, _Intrinsics]) -> PhotographPose | None:
@@ -187,7 +234,16 @@ def _pose_of_image(record: _ImageRecord, intrinsics: dict[int, _Intrinsics]) -> 
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-    return PhotographPose(name, rotation, -rotation.T @ translation, camera.fov_y_degrees, camera.aspect)
+    return _photograph_pose(name, rotation, -rotation.T @ translation, camera)
+
+
+def _photograph_pose(
+    name: str,
+    rotation: Float64[np.ndarray, "3 3"],
+    centre: Float64[np.ndarray, "3"],
+    camera: _Intrinsics,
+) -> PhotographPose:
+    return PhotographPose(name, rotation, centre, camera.fov_y_degrees, camera.aspect, camera.is_panorama)
 
 
 def _read_cameras_bin(file: IO[bytes]) -> dict[int, _Intrinsics]:
@@ -200,8 +256,12 @@ def _read_cameras_bin(file: IO[bytes]) -> dict[int, _Intrinsics]:
         if model not in _PARAMETER_COUNTS:
             raise ValueError(f"unsupported COLMAP camera model {model}")
         parameters = _unpack(file, f"<{_PARAMETER_COUNTS[model]}d")
-        fy = parameters[0 if model in _SINGLE_FOCAL_MODELS else 1]  # after fx, where there are two
-        found = _intrinsics_from_focal(width, height, fy)
+        if model == _PANORAMA_MODEL:
+            intrinsics[camera_id] = _PANORAMA_MIDDLE
+            continue
+        found = _intrinsics_from_focal(
+            width, height, *_focal_lengths(parameters, model in _SINGLE_FOCAL_MODELS)
+        )
         if found is not None:
             intrinsics[camera_id] = found
     return intrinsics
@@ -233,8 +293,7 @@ def _read_cameras_txt(file: IO[bytes]) -> dict[int, _Intrinsics]:
         if not words:
             continue
         parameters = [float(word) for word in words[4:]]
-        fy = parameters[0 if words[1] in _SINGLE_FOCAL_NAMES else 1]
-        found = _intrinsics_from_focal(float(words[2]), float(words[3]), fy)
+        found = _named_intrinsics(words[1], float(words[2]), float(words[3]), parameters)
         if found is not None:
             intrinsics[int(words[0])] = found
         _check_record_count(len(intrinsics))

@@ -189,7 +189,10 @@ async def show_new(
         chosen=dataset or (earlier.dataset_id if earlier else None),
         earlier=earlier,
         may_begin_with=found is not None and await may_be_begun_with(service, kind, found.row),
-        queues=sorted({"cpu", *(queue for worker in workers for queue in worker.queues)} - {""}),
+        queues=sorted(
+            {"cpu", *([earlier.queue] if earlier else ()), *(q for worker in workers for q in worker.queues)}
+            - {""}
+        ),
         max_file_bytes=service.settings.max_upload_bytes,
     )
 

@@ -21,6 +21,9 @@ from octasplat.service.problems import ProblemError, not_found_error, problem_fr
 from octasplat.service.web.templating import render_page
 
 logger = logging.getLogger(__name__)
+
+MAX_NEXT = 2000
+"""Longest address, in characters, that is gone to after a sign-in."""
 Handler = Callable[[Request], Coroutine[Any, Any, Response]]
 
 
@@ -87,13 +90,20 @@ def safe_local_path(address: str | None) -> str:
     return address if address.isprintable() else "/"
 
 
+def _page_of(address: str) -> str:
+    """Return path and query of an address on this site, the path alone where that is all that fits."""
+    parts = urllib.parse.urlsplit(address)
+    whole = f"{parts.path}?{parts.query}" if parts.query else parts.path
+    return safe_local_path(whole if len(whole) <= MAX_NEXT else parts.path)
+
+
 def _error_response(request: Request, problem: ProblemError) -> Response:
     if problem.status == 401:
         # After the sign-in to the page that was asked for, not to an action or a part of a page.
-        where = request.url.path if request.method == "GET" and not is_htmx_request(request) else "/"
+        where = str(request.url) if request.method == "GET" and not is_htmx_request(request) else "/"
         if is_htmx_request(request):
-            where = urllib.parse.urlsplit(request.headers.get("hx-current-url", "/")).path
-        return redirect(request, f"/sign-in?next={urllib.parse.quote(safe_local_path(where), safe='/')}")
+            where = request.headers.get("hx-current-url", "/")
+        return redirect(request, f"/sign-in?next={urllib.parse.quote(_page_of(where), safe='/')}")
     if is_htmx_request(request):
         notice = json.dumps({"notice": {"text": problem.detail, "bad": True}})
         return Response(status_code=problem.status, headers={"HX-Reswap": "none", "HX-Trigger": notice})

@@ -14,7 +14,7 @@ from octasplat.service.auth import (
     session_secret,
 )
 from octasplat.service.state import Service, ServiceDep
-from octasplat.service.web.routing import PageRoute, redirect, safe_local_path
+from octasplat.service.web.routing import MAX_NEXT, PageRoute, redirect, safe_local_path
 from octasplat.service.web.templating import render_page
 from octasplat.workers.db.rows import Token
 from octasplat.workers.db.sessions import begin_session, end_session, use_link
@@ -27,7 +27,7 @@ _MAX_FORM_BYTES = 4096
 
 @router.get("/sign-in")
 async def show_sign_in(
-    request: Request, next: Annotated[str | None, Query(max_length=500)] = None
+    request: Request, next: Annotated[str | None, Query(max_length=MAX_NEXT)] = None
 ) -> Response:
     """Return the sign-in form."""
     return render_page(request, "sign_in.html", next=safe_local_path(next), refused=False)

@@ -1,6 +1,5 @@
 """A scene in a browser of this machine: the viewer of the service's page, without the service."""
 
-import math
 import tempfile
 import weakref
 import webbrowser
@@ -15,7 +14,7 @@ from octasplat.notebook import log_event
 from octasplat.paths import PathLike
 from octasplat.runs import Run
 from octasplat.scenes import Scene, read_scene
-from octasplat.service.web.cameras import PhotographPose, viewer_cameras
+from octasplat.service.web.cameras import read_view_poses, viewer_cameras
 from octasplat.service.web.scene_server import SceneServer, ViewedScene
 
 
@@ -135,22 +134,29 @@ def serve_scene(scene: Scene, path: Path | None, *, port: int, background: str) 
 def _run_cameras(run: Path) -> Mapping[str, Any]:
     """Return where the photographs of a run were taken, for the page."""
     viewpoints = run_viewpoints(run)
-    poses = []
-    for shot in viewpoints.views:
-        camera = viewpoints.cameras[shot.camera_index]
-        # Of a pinhole camera; other lenses are shown as if they were one.
-        fov = 2 * math.degrees(math.atan(shot.height_px * math.tan(camera.pixel_angle_rad) / 2))
-        poses.append(
-            PhotographPose(
-                shot.name,
-                shot.rotation_cam_from_world,
-                shot.origin_world,
-                fov,
-                shot.width_px / shot.height_px,
-            )
-        )
+    content = {
+        "cameras": [
+            {
+                "model": camera.model,
+                "params": camera.params,
+                "width_px": camera.width_px,
+                "height_px": camera.height_px,
+            }
+            for camera in viewpoints.cameras
+        ],
+        "views": [
+            {
+                "name": shot.name,
+                "camera": shot.camera_index,
+                "rotation_cam_from_world": shot.rotation_cam_from_world,
+                "translation_cam_from_world": shot.translation_cam_from_world,
+            }
+            for shot in viewpoints.views
+        ],
+    }
     held_out = [viewpoints.views[number].name for number in viewpoints.test_indices.tolist()]
-    return viewer_cameras(poses, held_out)
+    poses = read_view_poses(content)
+    return viewer_cameras(poses, held_out) if poses else {"views": []}
 
 
 def _close_server(server: SceneServer, folder: "tempfile.TemporaryDirectory[str]") -> None:

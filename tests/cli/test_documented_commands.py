@@ -57,6 +57,11 @@ LIT_SURFACE = {"--texture-size": "128", "--max-triangles": "400"}
 """What a surface with materials has by itself, larger."""
 
 
+def is_long(command: DocumentedCommand) -> bool:
+    """Return whether a command takes long, as what it trains has materials."""
+    return command.page in LONG or (command.words[0] == "reconstruct" and "--materials" in command.words)
+
+
 def runnable() -> list[Any]:
     """Return the commands that can run without a service, each once; those that take long are exhaustive."""
     found = {
@@ -66,7 +71,7 @@ def runnable() -> list[Any]:
         if command.words and command.words[0] in VERBS
     }
     return [
-        pytest.param(command, marks=[pytest.mark.exhaustive] if command.page in LONG else [])
+        pytest.param(command, marks=[pytest.mark.exhaustive] if is_long(command) else [])
         for command in found.values()
     ]
 
@@ -81,20 +86,23 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def runs(photographs: Path) -> dict[bool, Path]:
-    """A finished run without materials, and one with them."""
-    folders = {shiny: photographs.parent / f"run_{shiny}" for shiny in (False, True)}
-    osp.reconstruct(photographs, folders[False], **RUN_OPTIONS)
+def plain_run(photographs: Path) -> Path:
+    """A finished run without materials."""
+    osp.reconstruct(photographs, photographs.parent / "run", **RUN_OPTIONS)
+    return photographs.parent / "run"
+
+
+@pytest.fixture(scope="module")
+def materials_run(photographs: Path) -> Path:
+    """A finished run with materials."""
     # An iteration with materials takes about as long as forty without.
     few = {**RUN_OPTIONS, "iterations": 10, "rays_per_batch": 128}
-    osp.reconstruct(photographs, folders[True], **few, materials=True)
-    return folders
+    osp.reconstruct(photographs, photographs.parent / "materials_run", **few, materials=True)
+    return photographs.parent / "materials_run"
 
 
 @pytest.fixture
-def folder(
-    tmp_path: Path, photographs: Path, runs: dict[bool, Path], monkeypatch: pytest.MonkeyPatch
-) -> Path:
+def folder(tmp_path: Path, photographs: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with the files that the pages name, as the current one."""
     for name in PHOTOGRAPHS:
         shutil.copytree(photographs, tmp_path / name, dirs_exist_ok=True)
@@ -196,9 +204,12 @@ def _has_no_use(words: Sequence[str], option: str) -> bool:
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("command", runnable(), ids=str)
-def test_command_of_a_page_runs(command: DocumentedCommand, folder: Path, runs: dict[bool, Path]) -> None:
+def test_command_of_a_page_runs(
+    command: DocumentedCommand, folder: Path, request: pytest.FixtureRequest
+) -> None:
     words = list(command.words)
-    add_scenes(folder, runs[command.page in WITH_MATERIALS], words)
+    run = "materials_run" if command.page in WITH_MATERIALS else "plain_run"
+    add_scenes(folder, request.getfixturevalue(run), words)
     if "--stage" in words:
         run_cli("stage", "init", words[1], "-o", "stage.toml")
     if "--resume" in words:

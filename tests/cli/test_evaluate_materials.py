@@ -74,6 +74,7 @@ def test_materials_light_and_relit_pictures_are_measured(shiny_run, scene_with_t
     assert 'id="environment"' in report
 
 
+@pytest.mark.exhaustive
 def test_relight_run_at_own_and_other_views(shiny_run, scene_with_truth, octasplat, tmp_path):
     dim = scene_with_truth / "env" / "dim.hdr"
     done = octasplat("relight", shiny_run, "--environment", dim, "-o", tmp_path / "own", "--samples", 1)
@@ -93,6 +94,7 @@ def test_relight_run_at_own_and_other_views(shiny_run, scene_with_truth, octaspl
     )  # 0.25 is 0.54 in display values, and rough metal of albedo 0.25 sends back less
 
 
+@pytest.mark.exhaustive
 def test_relight_job_uses_uploaded_files(shiny_run, scene_with_truth, tmp_path):
     shutil.copytree(shiny_run, tmp_path / "attempt" / "run")
     shutil.copytree(scene_with_truth / "env", tmp_path / "attempt" / "files" / "maps")

@@ -95,6 +95,7 @@ def test_render_of_materials_run_is_shaded_as_its_evaluation(materials_run, octa
     assert (tmp_path / "plain" / rendered[0].name).read_bytes() != rendered[0].read_bytes()
 
 
+@pytest.mark.exhaustive
 def test_near_field_run_is_rendered_as_evaluated_and_relit_with_a_warning(scene, octasplat, tiny, tmp_path):
     near = ("--set", "materials.recipe=near_field")
     result = octasplat("reconstruct", scene, "-o", tmp_path / "run", *tiny, *MATERIALS, *near)
@@ -130,6 +131,7 @@ def test_exr_of_materials_run_keeps_radiance_above_white(materials_run, octaspla
     assert np.abs(read_image(tmp_path / "a.png")[..., 0] - clipped).max() < 1 / 255
 
 
+@pytest.mark.exhaustive
 def test_scene_of_materials_run_in_memory_shows_materials(materials_run, octasplat, tmp_path):
     """The same picture as that of the command, also of a copy; harmonics where they are asked for."""
     pose = [[1, 0, 0, 0], [0, 1, 0, -0.5], [0, 0, 1, -2.5], [0, 0, 0, 1]]

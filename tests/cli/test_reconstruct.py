@@ -13,6 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.support.daily import some_daily
+
 FILES = (
     "scene.ply", "viewer.glb", "octagons.ply", "octagons.obj", "octagons.glb", "metrics.json", "report.html",
     "config.json",
@@ -112,7 +114,10 @@ def test_resume_without_run_starts_and_quiet_prints_nothing(scene, octasplat, ti
     assert json.loads((tmp_path / "run" / "held_out.json").read_text()) == ["view_001.png", "view_002.png"]
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "code"),
+    some_daily([(signal.SIGINT, 130), (signal.SIGTERM, 143)], {(signal.SIGINT, 130)}),
+)
 def test_signal_writes_checkpoint_and_resume_completes(
     scene, start_octasplat, octasplat, tiny, tmp_path, number, code
 ):

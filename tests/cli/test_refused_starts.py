@@ -84,6 +84,7 @@ def test_foreign_cache_folder_is_kept(scene, octasplat, tmp_path, tiny):
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["cache"]
 
 
+@pytest.mark.exhaustive
 @pytest.mark.heavy
 def test_poses_are_kept_when_the_settings_are_refused(octasplat, tmp_path, tiny):
     photographs, output = tmp_path / "photographs", tmp_path / "out"

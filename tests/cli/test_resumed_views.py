@@ -11,6 +11,7 @@ import pytest
 from octasplat.engine.core.errors import CancelledError, ConfigError
 from octasplat.engine.core.events import Event, ImagesSaved
 from octasplat.engine.operations import relight, render
+from tests.support.daily import some_daily
 
 
 def stopped_after_one(verb: Any, request: Any) -> None:
@@ -53,7 +54,7 @@ def test_changed_middle_photograph_starts_new_render(shiny_run, tmp_path, verb):
     assert goes_on(module, one)
 
 
-@pytest.mark.parametrize("verb", ["render", "relight"])
+@pytest.mark.parametrize("verb", some_daily(["render", "relight"], {"relight"}))
 def test_changed_middle_camera_starts_new_render(shiny_run, tmp_path, verb):
     def path(middle: float) -> dict[str, Any]:
         poses = [[[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, -4], [0, 0, 0, 1]] for x in (0, middle, 1)]
@@ -67,6 +68,7 @@ def test_changed_middle_camera_starts_new_render(shiny_run, tmp_path, verb):
     assert goes_on(module, one)
 
 
+@pytest.mark.exhaustive
 def test_photographs_of_another_folder_are_another_relight(run, shiny_run, tmp_path):
     moved = tmp_path / "moved"
     shutil.copytree(run.scene, moved)

@@ -218,6 +218,7 @@ def test_corrected_poses_give_other_distances(with_geometry: Path, tmp_path: Pat
     assert before.views_record.depths_sha256 == after.views_record.depths_sha256  # of the files alone
 
 
+@pytest.mark.exhaustive
 def test_changed_geometry_is_noticed(with_geometry: Path, tmp_path: Path) -> None:
     model, first = load_dataset_model(with_geometry), find_known_geometry(with_geometry)
     mesh = read_mesh(with_geometry / "geometry.ply")

@@ -213,6 +213,23 @@ def test_the_angle_of_a_photograph_comes_before_the_focal_length_of_all(scene: P
     assert [way[0] / way[2] for way in seen[:3]] == pytest.approx([16 / 30, 16 / 40, 16 / 30])
 
 
+@pytest.mark.parametrize("own", [{"camera_angle_x": 2 * math.atan(16 / 40)}, {"fl_x": 40.0}])
+@pytest.mark.parametrize(
+    "common", [{"camera_angle_x": 1.0, "camera_angle_y": 0.9}, {"fl_x": 30.0, "fl_y": 31.0}]
+)
+def test_the_focal_length_of_a_photograph_holds_down_as_well(
+    scene: Path, own: dict[str, float], common: dict[str, float]
+) -> None:
+    root = _copy(scene, "other")
+    frames = _frames(load_dataset_model(scene))
+    frames[1] |= own
+    _write(root, frames, w=32, h=24, **common)
+    found = load_dataset_model(root)
+    camera = found.cameras[found.views[1].camera_index]
+    right, down = camera.directions_cam(np.array([[32.0, 12.0], [16.0, 24.0]]))
+    assert (right[0] / right[2], down[1] / down[2]) == pytest.approx((16 / 40, 12 / 40))
+
+
 def test_masks_are_found_however_their_names_are_spelt(scene: Path, save_image: Callable[..., None]) -> None:
     root = _copy(scene, "other")
     frames = _frames(load_dataset_model(scene))

@@ -11,6 +11,7 @@ from octasplat.engine.edit.edit_options import MeshToGaussiansOptions
 from octasplat.engine.edit.mesh_to_gaussians import recover_gaussians
 from octasplat.engine.files import export_scene, read_mesh
 from octasplat.engine.gaussians.model import FlatGaussians
+from tests.support.daily import some_daily
 from tests.support.edit_scenes import assert_same, covariance_errors, moved_covariances, twist
 
 pytestmark = pytest.mark.tools
@@ -18,7 +19,7 @@ Make = Callable[..., FlatGaussians]
 ROUTES = ("mesh.ply", "mesh.obj", "mesh.glb")
 
 
-@pytest.mark.parametrize("name", ROUTES)
+@pytest.mark.parametrize("name", some_daily(ROUTES, {"mesh.glb"}))
 def test_edit_unchanged_blender_export_gives_same_scene(
     blender, make_scene: Make, tmp_path: Path, name: str
 ) -> None:

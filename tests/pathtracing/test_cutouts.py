@@ -99,6 +99,7 @@ def test_what_is_not_there_does_not_shine() -> None:
         assert irradiance(0.35, depth) == pytest.approx(0.35 * irradiance(1.0, depth), rel=0.02)
 
 
+@pytest.mark.exhaustive
 def test_shadow_of_gauze_on_gaussians_is_its_opacity() -> None:
     screen = wall(0.0, 2.0)
     sun = DirectionalLight(direction=(0, 0, 1), irradiance=5)

@@ -13,6 +13,7 @@ from click.testing import CliRunner, Result
 
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.workers.cli.main import cli
+from tests.support.daily import some_daily
 from tests.support.light_scenes import table_with_a_box
 
 STAGE = """
@@ -103,7 +104,7 @@ def stopped(folder: Path) -> subprocess.CompletedProcess[str]:
     return stopped_by(signal.SIGINT, folder, "views", folder / "views" / "unfinished.jsonl")
 
 
-@pytest.mark.parametrize("changed", ["stage.toml", "thing.obj", "scene.ply"])
+@pytest.mark.parametrize("changed", some_daily(["stage.toml", "thing.obj", "scene.ply"], {"scene.ply"}))
 def test_images_of_another_stage_are_not_mixed_in(
     folder: Path, stopped: subprocess.CompletedProcess[str], tmp_path: Path, changed: str
 ) -> None:

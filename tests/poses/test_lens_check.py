@@ -77,6 +77,7 @@ def test_lens_check_flags_shifted_principal_points_only(moved: Path, still: Path
         assert needs_per_view_principal_points(scene, scene.points, scene.observations) is expected
 
 
+@pytest.mark.exhaustive
 def test_shifted_principal_points_are_found(moved: Path, tmp_path: Path) -> None:
     model, found = moved / "sparse" / "0", tmp_path / "found"
     facts = adjust_principal_points(model, found)

@@ -95,6 +95,7 @@ def test_pose_repair_without_errors_writes_nothing(scene: Path, tmp_path: Path) 
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.exhaustive
 def test_pose_repair_unreadable_model_is_refused(scene: Path, tmp_path: Path) -> None:
     given = GivenModel(model=tmp_path / "gone", names=("view_000.png", "view_001.png"), doubtful=(0,))
     with pytest.raises(DatasetError, match=r"gone.cameras.txt cannot be read"):

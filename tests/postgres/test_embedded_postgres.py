@@ -141,6 +141,7 @@ def test_postgres_other_version_is_refused_without_deletion(server: EmbeddedPost
     assert answer(server.start(), "SELECT 1") == "1"
 
 
+@pytest.mark.exhaustive
 def test_half_made_database_is_made_again(server: EmbeddedPostgres) -> None:
     left = server.home / "cluster.123.partial"
     left.mkdir(parents=True)
@@ -164,6 +165,7 @@ def test_unknown_version_of_binaries_is_named() -> None:
     assert find_binaries().major >= 14
 
 
+@pytest.mark.exhaustive
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root runs the server as somebody else")
 def test_binaries_out_of_the_servers_reach_are_copied(
     short_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -84,6 +84,7 @@ def test_fetching_from_a_bucket_goes_on_where_it_was(front: FrontEnd, place: str
     bucket.close()
 
 
+@pytest.mark.exhaustive
 def test_archive_of_a_bucket_is_fetched_and_what_is_not_there_is_told(
     front: FrontEnd, place: str, conninfo: str
 ) -> None:
@@ -133,6 +134,7 @@ def test_folder_with_odd_characters_in_its_name_is_that_folder(front: FrontEnd, 
         assert told.exit_code == 1 and "unexpected" not in told.stderr, told.output
 
 
+@pytest.mark.exhaustive
 def test_temporary_credentials_with_long_tokens_do(
     front: FrontEnd, place: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -121,6 +121,28 @@ async def test_trained_block_is_shown_in_the_place_of_its_coarse_gaussians(
             assert await cursor.fetchone() == {"n": 0}
 
 
+async def test_state_of_a_former_version_is_not_taken_for_that_of_blocks(
+    connect_service: ConnectService, folder: Path
+) -> None:
+    async with connect_service() as (http, service):
+        job, attempts, _ = await begin(http, service, folder)
+        for attempt in attempts:
+            await attempt.succeed([], job_queue=service.job_queue)
+        merge = await claim_job(service, job)
+        column = "SELECT block_gaussians FROM live_scenes WHERE job_id = %s"
+        async with service.pool.connection() as connection:
+            row = await (await connection.execute(column, [job["id"]])).fetchone()
+        assert row is not None
+        # As many Gaussians as the coarse file has; such a worker does not know the column and leaves it.
+        await show(service, merge, ply(folder, COARSE + 300), 36, 4)
+        async with service.pool.connection() as connection:
+            await connection.execute(
+                "UPDATE live_scenes SET block_gaussians = %s WHERE job_id = %s",
+                [row["block_gaussians"], job["id"]],
+            )
+        np.testing.assert_array_equal(await shown(http, job, folder), COARSE + 300)
+
+
 async def test_blocks_that_end_at_once_are_both_shown(connect_service: ConnectService, folder: Path) -> None:
     async with connect_service() as (http, service):
         job, attempts, _ = await begin(http, service, folder)

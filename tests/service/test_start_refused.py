@@ -22,6 +22,7 @@ def start(**environment: str) -> "subprocess.CompletedProcess[str]":
     )
 
 
+@pytest.mark.exhaustive
 def test_start_with_database_down_is_refused(tmp_path: Path) -> None:
     done = start(DATABASE_URL="postgresql://user:hush@127.0.0.1:9/x", OCTASPLAT_DATA=str(tmp_path))
     assert (done.returncode, done.stdout) == (1, "")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image, ImageOps
 
 from octasplat.engine.core.errors import DatasetError, OutputError
 from octasplat.engine.core.events import Event, Noted, Warned
@@ -50,6 +51,17 @@ def test_photographs_of_the_run_are_taken_wherever_they_are(folder: Path) -> Non
     assert training_photographs(folder / "run", None, 1, events.append) == ()
     (note,) = (event.message for event in events if isinstance(event, Noted))
     assert "not on this machine" in note
+
+
+def test_photographs_developed_anew_stand_where_their_own_model_says(folder: Path) -> None:
+    content = json.loads((folder / "run" / "config.json").read_text())
+    content["reconstruction"]["model"] = "sparse/7"  # of the several that the run had the choice of
+    (folder / "run" / "config.json").write_text(json.dumps(content))
+    for path in (folder / "scene" / "images").iterdir():
+        ImageOps.invert(Image.open(path).convert("RGB")).save(path)
+    train = sum(not view.held_out for view in read_views(folder / "run" / "views.json").views)
+    (folder / "scene").rename(folder / "elsewhere")
+    assert len(training_photographs(folder / "run", folder / "elsewhere", 1, lambda _event: None)) == train
 
 
 def test_photographs_of_another_model_are_refused_or_left_out_with_a_word(folder: Path) -> None:

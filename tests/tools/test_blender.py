@@ -52,6 +52,7 @@ def test_cycles_render_equals_tracer(scene: FlatGaussians, blend: Path, tmp_path
     assert psnr_db(image, our_view(scene, shell_cameras()[frame])) >= 55.0
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(("name", "view"), [("a.glb", "standard"), ("a.mesh.ply", "standard")])
 def test_blender_standard_view_matches(scene: FlatGaussians, tmp_path: Path, name: str, view: str) -> None:
     """Of a GLB, too, whose colors and opacities Blender keeps in 8 bits."""
@@ -117,6 +118,7 @@ def test_blender_script_mesh_ply_round_trip(blend: Path, tmp_path: Path) -> None
     assert_same_ply(tmp_path / "b.ply", blend.with_name("scene.mesh.ply"))
 
 
+@pytest.mark.exhaustive
 def test_blender_obj_keeps_order_colors_and_texture_coordinates(scene: FlatGaussians, tmp_path: Path) -> None:
     export_scene(scene, tmp_path / "a.obj")
     run_blender(SCRIPTS / "round_trip.py", tmp_path / "a.obj", tmp_path / "b.obj")

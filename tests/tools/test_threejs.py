@@ -57,6 +57,7 @@ def test_averaged_frames_have_the_right_order_where_octagons_cross(cameras: Path
     assert refined_db > 37.0
 
 
+@pytest.mark.exhaustive
 def test_threejs_more_chunks_reduce_error(cameras: Path, tmp_path: Path) -> None:
     scene = shell_scene(20000)
     ours = to_bytes(our_view(scene, shell_cameras()[0]))
@@ -79,6 +80,7 @@ def test_threejs_opaque_variant_is_order_independent(
     np.testing.assert_array_equal(images[0], images[1])
 
 
+@pytest.mark.exhaustive
 def test_threejs_opaque_cores_hide_background_in_any_order(cameras: Path, tmp_path: Path) -> None:
     # Two opaque discs that face the camera, the near one first, so that the far one is blended over it.
     camera = shell_cameras()[0]

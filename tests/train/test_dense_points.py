@@ -99,6 +99,7 @@ def test_dense_points_cover_objects_without_sparse_points(
     assert right[lifted.swept].mean() > 0.75 and right.mean() > 0.85
 
 
+@pytest.mark.exhaustive
 def test_dense_points_single_view_option_lifts_pixels(surface: cKDTree, tmp_path: Path) -> None:
     config = SyntheticDatasetConfig(views=6, width_px=160, height_px=120, points=1500, samples_per_side=1)
     write_synthetic_dataset(tmp_path / "scene", config)
@@ -145,6 +146,7 @@ def test_dense_points_independent_of_threads(dataset: Dataset) -> None:
     assert_same(one, three)
 
 
+@pytest.mark.exhaustive
 def test_dense_points_skip_sky(dataset: Dataset, tmp_path: Path) -> None:
     """Photographs that show the same color in a direction from wherever they are: all sky."""
     shutil.copytree(dataset.root, tmp_path / "scene")
@@ -162,6 +164,7 @@ def test_dense_points_skip_sky(dataset: Dataset, tmp_path: Path) -> None:
     assert lifted[0] > 250 and lifted[1] < 0.8 * lifted[0]
 
 
+@pytest.mark.exhaustive
 def test_dense_points_near_surface_with_background_are_lifted(dataset: Dataset) -> None:
     plain = plane_sweep_points(dataset, 1000, np.random.default_rng(0))
     before = plane_sweep_points(
@@ -170,6 +173,7 @@ def test_dense_points_near_surface_with_background_are_lifted(dataset: Dataset) 
     assert len(before) > 0.9 * len(plain)
 
 
+@pytest.mark.exhaustive
 def test_dense_points_compensate_for_empty_pixels(dataset: Dataset, tmp_path: Path) -> None:
     shutil.copytree(dataset.root, tmp_path / "scene")
     masks = tmp_path / "scene" / "masks"

@@ -344,11 +344,13 @@ const steps = {
         await page.selectOption("#viewer .views", String(held - 1));
         found.place = await page.textContent("#viewer .place");
         await page.selectOption("#viewer .photo-mode", "over");
+        await page.waitForSelector("#viewer .photo:not([hidden])");
         found.photograph = await page.evaluate(async () => {
             const image = document.querySelector("#viewer .photo");
             await image.decode();
-            const box = image.getBoundingClientRect(), screen = image.parentElement.getBoundingClientRect();
-            return { alt: image.alt, width: image.naturalWidth, ratio: box.width / box.height, covers: box.height / screen.height };
+            // As the page lays it out, before it is turned as its camera was.
+            const { offsetWidth: width, offsetHeight: height } = image;
+            return { alt: image.alt, width: image.naturalWidth, ratio: width / height, covers: height / image.parentElement.clientHeight };
         });
         await page.waitForTimeout(500);
         await shot(page, "live_photograph");

@@ -14,6 +14,7 @@ MAX_NAME = 200
 """Of a dataset and of a job, in characters."""
 
 
+@pytest.mark.exhaustive
 def test_archives_with_long_names_become_jobs(
     service: RunningService, browse: Browse, tmp_path: Path
 ) -> None:

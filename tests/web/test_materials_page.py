@@ -105,6 +105,7 @@ def test_materials_page_offers_layers_relight_and_edit(
     assert found["nameless"] == [] and found["overflow"] <= 0 and found["complaints"] == []
 
 
+@pytest.mark.exhaustive
 def test_result_without_materials_has_no_materials_page(
     service: RunningService, folder: Path, job: str, tmp_path: Path
 ) -> None:

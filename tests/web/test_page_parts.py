@@ -1,9 +1,11 @@
 """Pages without a browser: headers, errors as pages, owners, escaping, words."""
 
 import datetime
+import html
 import re
 import subprocess
 import sys
+import urllib.parse
 import uuid
 
 import pytest
@@ -122,6 +124,16 @@ async def test_names_of_users_are_text(connect_service: ConnectService, database
             assert HOSTILE not in text and "&#34;&gt;&lt;img" in text
 
 
+async def test_job_that_is_run_again_keeps_its_queue(connect_service: ConnectService, database: str) -> None:
+    async with connect_service() as (http, _):
+        job = await make_job(database, queue="night")
+        page = (await http.get("/new", params={"like": str(job)})).text
+        queues = re.search(r'<select id="queue">(.*?)</select>', page)
+        assert queues is not None
+        options = re.findall(r'<option value="(\w+)"( selected)?>', queues[1])
+        assert options == [("cpu", ""), ("night", " selected")]
+
+
 async def test_job_list_shows_own_jobs_only(connect_service: ConnectService, database: str) -> None:
     async with connect_service(signed_in=False) as (http, _):
         job = await make_job(database, owner="ann", label="of ann")
@@ -148,6 +160,13 @@ async def test_job_list_shows_own_jobs_only(connect_service: ConnectService, dat
         assert (await http.get("/new", headers=as_user["eve"])).status_code == 403
         unknown = await http.get("/new")
         assert unknown.status_code == 303 and unknown.headers["location"] == "/sign-in?next=/new"
+        asked = await http.get("/compare", params={"job": ["1", "2"], "view": "a b.png"})
+        following = "/compare?job=1&job=2&view=a+b.png"
+        wanted = "/sign-in?next=" + urllib.parse.quote(following, safe="/")
+        assert asked.status_code == 303 and asked.headers["location"] == wanted
+        assert f'value="{html.escape(following)}"' in (await http.get(wanted)).text
+        long = await http.get("/compare", params={"job": ["1" * 40] * 60})
+        assert long.headers["location"] == "/sign-in?next=/compare"
         part = await http.get("/parts/jobs", headers={"HX-Request": "true"})
         assert part.status_code == 200 and part.headers["hx-redirect"].startswith("/sign-in")
 

@@ -20,6 +20,7 @@ from octasplat.engine.render.renderer import background_color, render_rays
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import TraceSettings
 from tests.support.browser import Page, open_page, psnr
+from tests.support.daily import some_daily
 from tests.support.light_scenes import shiny_ball
 from tests.support.shell_scene import our_view, shell_scene
 
@@ -51,6 +52,7 @@ window.result = (async () => {
   if (job.light) {
     view.setLight(readHdr(await (await fetch("/files/light.hdr")).arrayBuffer()));
     view.lighting.turn(job.light.up, job.light.degrees);
+    await view.setScene(scene, job.q); // as where the device's graphics were gone: it keeps the light
   }
   const camera = new PerspectiveCamera(job.fov, 1, 0.01, 100);
   camera.matrixAutoUpdate = false;
@@ -112,7 +114,7 @@ def with_harmonics(scene: FlatGaussians, degree: int) -> FlatGaussians:
     return scene
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("degree", some_daily([0, 1, 2, 3], {0, 3}))
 def test_viewer_draws_traced_image(tmp_path: Path, degree: int) -> None:
     scene = with_harmonics(shell_scene(), degree)
     camera = camera_at(0.2, -0.3, -4.0)
@@ -139,7 +141,7 @@ def test_viewer_with_paper_radius_over_white(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("metallic", "roughness", "degrees", "least"),
-    [(1.0, 0.1, 0, 25.0), (1.0, 0.4, 90, 38.0), (0.0, 0.8, -30, 45.0)],
+    some_daily([(1.0, 0.1, 0, 25.0), (1.0, 0.4, 90, 38.0), (0.0, 0.8, -30, 45.0)], {(1.0, 0.4, 90, 38.0)}),
 )
 def test_draws_materials_in_the_light_of_a_map(
     tmp_path: Path, metallic: float, roughness: float, degrees: int, least: float

@@ -27,6 +27,8 @@ PAGE = """<!doctype html>
 <html><body><script type="module">
 import { PerspectiveCamera, Vector3 } from "/files/vendor/three.js";
 import { removedBy } from "/files/viewer/cleaning.js";
+import { readHdr } from "/files/viewer/environment.js";
+import { toHalf } from "/files/viewer/half.js";
 import { makeTree } from "/files/viewer/nearest.js";
 import { pick } from "/files/viewer/picking.js";
 import { readGaussians } from "/files/viewer/ply.js";
@@ -159,6 +161,25 @@ def test_points_are_picked_where_half_of_the_light_is_stopped(tmp_path: Path) ->
     np.testing.assert_allclose(found[3], [0, 0, 1], atol=1e-6)  # the veil alone stops most of what is stopped
 
 
+def test_what_is_too_faint_to_be_drawn_is_not_picked(tmp_path: Path) -> None:
+    """Two hundred Gaussians too faint for an octagon, before a wall."""
+    count = 201
+    means = np.zeros((count, 3), np.float32)
+    means[:, 2] = np.linspace(1, 3, count)
+    opacities = np.full(count, 0.009)
+    opacities[-1] = 0.99
+    scene = FlatGaussians(
+        means_world=means,
+        quats_wxyz=np.tile(np.float32([1, 0, 1, 0]), (count, 1)),
+        log_scales=np.full((count, 2), np.log(0.5), np.float32),
+        opacity_logits=np.log(opacities / (1 - opacities)).astype(np.float32),
+        sh=np.zeros((count, 1, 3), np.float32),
+    )
+    write_gaussian_ply(scene, tmp_path / "scene.ply")
+    found = in_page(READ + "return pick(scene, [0, 0, 0], [0, 0, 1], 9.21);", tmp_path / "scene.ply")
+    np.testing.assert_allclose(found, [0, 0, 3], atol=1e-6)
+
+
 def test_what_is_not_drawn_is_not_picked(tmp_path: Path) -> None:
     """A streak that no photograph shows, before a wall that they show, is passed by as in the picture."""
     scene = FlatGaussians(
@@ -187,12 +208,22 @@ def test_what_is_not_drawn_is_not_picked(tmp_path: Path) -> None:
 
 def test_links_keep_a_view_and_nothing_else_is_taken_for_one() -> None:
     found = in_page(
-        "const link = linkOf([1.25, -2, 1e-7], [0, 3.5, -40000], 51.5);"
-        "return { link, view: viewOf(link), others: job.others.map(viewOf) };",
-        others=["", "#h-view", "#view=1,2,3", "#view=1,2,3,4,5,6,x", "#view=1,2,3,4,5,6,1e999"],
+        "const link = linkOf([1.25, -2, 1e-7], [0, 3.5, -40000], 51.5, 0.75);"
+        "const older = viewOf('#view=1,2,3,4,5,6,50');"
+        "return { link, view: viewOf(link), older, others: job.others.map(viewOf) };",
+        others=[
+            "",
+            "#h-view",
+            "#view=1,2,3",
+            "#view=1,2,3,4,5,6,x",
+            "#view=1,2,3,4,5,6,1e999",
+            "#view=1,2,3,4,5,6,7,8,9",
+        ],
     )
-    assert found["view"] == {"position": [1.25, -2, 1e-7], "target": [0, 3.5, -40000], "fovY": 51.5}
-    assert found["others"] == [None] * 5
+    expected = {"position": [1.25, -2, 1e-7], "target": [0, 3.5, -40000], "fovY": 51.5, "aspect": 0.75}
+    assert found["view"] == expected
+    assert found["older"] == {"position": [1, 2, 3], "target": [4, 5, 6], "fovY": 50}
+    assert found["others"] == [None] * 6
 
 
 def test_nearest_neighbors_are_those_of_a_full_search() -> None:
@@ -206,3 +237,27 @@ def test_nearest_neighbors_are_those_of_a_full_search() -> None:
     distances = np.linalg.norm(points[:, None] - points[None], axis=2)
     np.fill_diagonal(distances, np.inf)
     np.testing.assert_allclose(found, np.sort(distances, axis=1)[:, :7], atol=1e-12)
+
+
+def test_half_precision_numbers_are_the_nearest() -> None:
+    values = [0.0, 6e-8, 3e-5, 0.1, -1.7, 1000.3, 32767.0, 32768.0, 40000.0, -50010.0, 65504.0, 65519.0]
+    beyond = [65520.0, 1e6, float("inf")]
+    found = in_page(
+        "return [...job.values, ...job.beyond.map(Number)].map(toHalf);",
+        values=values,
+        beyond=[str(value).replace("inf", "Infinity") for value in beyond],
+    )
+    shown = np.uint16(found).view(np.float16)
+    np.testing.assert_array_equal(shown, np.float16([*values, *[65504.0] * len(beyond)]))
+
+
+@pytest.mark.parametrize("kind", ["rgbe", "xyze"])
+def test_maps_in_other_colors_are_refused(kind: str) -> None:
+    header = f"#?RADIANCE\n# FORMAT=none\nFORMAT=32-bit_rle_{kind}\n\n-Y 1 +X 2\n"
+    found = in_page(
+        "const read = () => [...readHdr(new TextEncoder().encode(job.text).buffer).data];"
+        "try { return read(); } catch ({ message }) { return message; }",
+        text=header + "@@@\x7f" * 2,
+    )
+    refused = "The 3D view takes light from Radiance HDR files only."
+    assert found == ([0.125] * 6 if kind == "rgbe" else refused)

@@ -15,9 +15,10 @@ pytestmark = [pytest.mark.tools, pytest.mark.heavy]
 STATIC = Path(service_web.__file__).parent / "static"
 PAGE = """<!doctype html>
 <html><body><script type="module">
-import { Vector3 } from "/files/vendor/three.js";
+import { PerspectiveCamera, Vector3 } from "/files/vendor/three.js";
 import { Limits } from "/files/viewer/limits.js";
 import { Pacing } from "/files/viewer/pacing.js";
+import { Walking } from "/files/viewer/walking.js";
 import { makeSorter, shownBy } from "/files/viewer/sorting.js";
 const job = JOB;
 window.result = (() => { BODY })();
@@ -115,6 +116,80 @@ def test_gaussians_outside_of_all_photographs_are_left_out_and_the_heaviest_come
     assert found["shown"] == [1, 1, 0, 0] and found["free"] == [1, 1, 1, 1]
     assert found["all"] == [1, 0]  # the farthest first
     assert found["one"] == [1]  # the heaviest
+
+
+KEYS = [
+    ("m", "KeyM", "measure"),
+    ("M", "KeyM", "measure"),
+    ("m", "Semicolon", "measure"),  # of a French keyboard
+    ("\u0442", "KeyN", "next"),  # of a Russian one
+    ("l", "KeyN", None),  # of a Dvorak keyboard, whose N lies elsewhere
+    ("+", "BracketRight", "nearer"),  # of a German keyboard
+    ("-", "Slash", "farther"),
+    ("=", "Equal", "nearer"),
+    ("-", "Minus", "farther"),
+    ("z", "KeyW", "nearer"),  # as W lies
+    ("x", "KeyX", None),
+]
+"""What is on a key, its place, and what it does."""
+
+
+def test_keys_do_what_is_on_them() -> None:
+    found = in_page(
+        """
+        return job.keys.map(([key, code]) => {
+            const canvas = document.createElement("canvas"), done = [];
+            const camera = new PerspectiveCamera(50, 1, 0.1, 100);
+            camera.position.set(0, 0, 5);
+            const controls = { target: new Vector3() };
+            const walking = new Walking(canvas, camera, controls, 1, (action) => done.push(action), () => {});
+            canvas.dispatchEvent(new KeyboardEvent("keydown", { key, code }));
+            walking.step(0.05);
+            // With Shift pressed meanwhile.
+            canvas.dispatchEvent(new KeyboardEvent("keyup", { key: "*", code }));
+            const { z } = camera.position;
+            walking.step(0.05);
+            return [done[0] ?? (z < 5 ? "nearer" : z > 5 ? "farther" : null), camera.position.z === z];
+        });
+        """,
+        keys=[key[:2] for key in KEYS],
+    )
+    assert found == [[does, True] for _, _, does in KEYS]
+
+
+@pytest.mark.parametrize("overlap", [3, 9, 16, 25])
+def test_nothing_that_photographs_show_is_left_out_of_a_large_scene(overlap: int) -> None:
+    """A field from above in 20 x 20 photographs, each point in ``overlap`` of them; and streaks far away."""
+    side, height = 20, 10.0
+    angle = 2 * np.degrees(np.arctan(np.sqrt(overlap) / 2 / height))
+    places = [(x, y) for y in range(side) for x in range(side)]
+    views = [{**view((x, y, height), (0, 0, -1)), "up": (0, 1, 0), "fov_y_degrees": angle} for x, y in places]
+    random = np.random.default_rng(4)
+    field = np.pad(random.uniform(2.5, side - 3.5, (300, 2)), ((0, 0), (0, 1)))
+    streaks = random.uniform(200, 300, (60, 3))
+    geometry = np.pad(np.concatenate([field, streaks]), ((0, 0), (0, 9)))
+    found = in_page(
+        "return Array.from(shownBy(360, new Float32Array(job.geometry), job.views));",
+        geometry=geometry.ravel().tolist(),
+        views=views,
+    )
+    assert found[:300] == [1] * 300
+    # Where hardly any photograph shows what, streaks are not told from the field.
+    assert found[300:] == [1 if overlap == 3 else 0] * 60
+
+
+def test_panoramas_show_what_is_behind_them() -> None:
+    """Four of six Gaussians are before no camera, but all of them are in each panorama."""
+    means = [(0, 0, 9), (0.1, 0, 9), (0, 0, -9), (9, 0, 0), (-9, 0, 0), (0, 9, 0)]
+    found = in_page(
+        """
+        const shown = (views) => Array.from(shownBy(6, new Float32Array(job.geometry), views));
+        return [shown(job.views.map((one) => ({ ...one, panorama: true }))), shown(job.views)];
+        """,
+        geometry=[value for mean in means for value in (*mean, 0.9, *[0] * 8)],
+        views=[view((0.1 * k, 0, 0), (0, 0, 1)) for k in range(4)] + [view((0, 0, 0), (1, 0, 0))] * 2,
+    )
+    assert found == [[1, 1, 1, 1, 1, 1], [1, 1, 0, 1, 0, 0]]
 
 
 @pytest.mark.parametrize("count", [40_000, 1_000_000])

@@ -111,6 +111,7 @@ def test_results_lost_from_the_store_are_made_again(bench: WorkerHarness, damage
     assert job.count_starts(job.attempt) == 1
 
 
+@pytest.mark.exhaustive
 def test_failed_block_fails_the_whole_and_a_retry_keeps_what_succeeded(bench: WorkerHarness) -> None:
     bench.worker(**KINDS)
     root = submit(bench, refuse=2)
@@ -140,6 +141,7 @@ def test_cancelling_ends_all_blocks_and_a_retry_goes_on(bench: WorkerHarness) ->
     assert bench.results(root) == {"sum.txt": DONE}
 
 
+@pytest.mark.exhaustive
 def test_cancelled_whole_without_workers_ends_at_once(bench: WorkerHarness) -> None:
     worker = bench.worker(**KINDS)
     root = submit(bench, hold=1)

@@ -20,6 +20,7 @@ def bench(conninfo: str, tmp_path: Path) -> Iterator[WorkerHarness]:
     bench.close()
 
 
+@pytest.mark.exhaustive
 def test_paused_queue_hands_out_nothing_and_another_one_does(bench: WorkerHarness) -> None:
     bench.run_query(lambda c: set_queue_paused(c, "cpu", True))
     worker = bench.worker(queues="cpu,other")

@@ -83,6 +83,7 @@ def test_unresponsive_child_of_draining_worker_is_killed_before_stale_limit(benc
         wait_for_end(child, STALE_SECONDS)
 
 
+@pytest.mark.exhaustive
 def test_reading_state_does_not_renew_heartbeat(bench: WorkerHarness) -> None:
     """The row can be read all the time; only the missing heartbeats tell that others may take over."""
     worker = bench.worker(STALE_SECONDS=str(STALE_SECONDS))
@@ -129,6 +130,7 @@ def test_job_limits_apply_while_disconnected(
         assert "said nothing" in reasons[0]
 
 
+@pytest.mark.exhaustive
 def test_cancelled_unresponsive_child_is_killed_while_disconnected(bench: WorkerHarness) -> None:
     worker = bench.worker(**LONG, GRACE_SECONDS="2")
     job_id = bench.submit(options=bench.wait_until_held(deaf=True))

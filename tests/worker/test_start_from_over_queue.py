@@ -144,6 +144,7 @@ def test_stopped_training_is_gone_on_with_to_the_same_bytes_after_a_kill(
     assert str(shared_bench.folder) not in results["events.jsonl"].decode()
 
 
+@pytest.mark.exhaustive
 def test_unsuitable_start_is_refused_with_the_name_of_its_job(
     shared_bench: WorkerHarness, dataset: uuid.UUID, stopped: uuid.UUID
 ) -> None:

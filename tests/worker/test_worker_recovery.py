@@ -158,6 +158,7 @@ def test_retry_from_the_start_forgets_the_checkpoint(shared_bench: WorkerHarness
     assert starts(shared_bench, job_id) == [0]
 
 
+@pytest.mark.exhaustive
 def test_unresponsive_program_is_killed_after_grace(bench: WorkerHarness) -> None:
     worker = bench.worker(GRACE_SECONDS="0.5")
     job_id = bench.submit(options={"steps": 100_000, "deaf": True})

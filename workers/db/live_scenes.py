@@ -7,7 +7,7 @@ blocks may end at once, on any workers.
 
 import uuid
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from octasplat.workers.db.connections import Connection, fetch_one
 
@@ -79,10 +79,11 @@ async def get_shown_scene(connection: Connection, job_id: uuid.UUID) -> ShownSce
     scene = await fetch_one(connection, LiveScene, query, [job_id])
     if scene is None:
         return None
-    counts = scene.block_gaussians
-    # Not so where a worker of the former version has written another file since.
-    if not counts or sum(counts) != scene.gaussians:
-        return ShownScene(scene)
+    *counts, mark = scene.block_gaussians or [0]
+    # Not so where a worker of the former version has written another file since, and left the column.
+    if mark != _mark_of_file(scene.sha256) or sum(counts) != scene.gaussians:
+        return ShownScene(replace(scene, block_gaussians=None))
+    scene = replace(scene, block_gaussians=counts)
     cursor = await connection.execute(
         """
         SELECT (jobs.options->>'number')::int AS number, sha256, gaussians,
@@ -98,6 +99,8 @@ async def get_shown_scene(connection: Connection, job_id: uuid.UUID) -> ShownSce
 
 async def put_live_scene(connection: Connection, scene: LiveScene) -> None:
     """Replace the live scene of a job."""
+    counts = scene.block_gaussians
+    marked = None if counts is None else [*counts, _mark_of_file(scene.sha256)]
     await connection.execute(
         """
         INSERT INTO live_scenes (job_id, sha256, views_sha256, step, gaussians, block_gaussians)
@@ -111,9 +114,14 @@ async def put_live_scene(connection: Connection, scene: LiveScene) -> None:
             scene.views_sha256,
             scene.step,
             scene.gaussians,
-            scene.block_gaussians,
+            marked,
         ],
     )
+
+
+def _mark_of_file(sha256: str) -> int:
+    """Return what stands behind the counts of blocks in the table, and tells of which file they are."""
+    return int(sha256[:7], 16)  # fits an integer of the database
 
 
 async def remove_live_scene(connection: Connection, job_id: uuid.UUID) -> None:

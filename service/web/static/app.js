@@ -1,4 +1,4 @@
-// What every page does: notices, and quiet polling.
+// What every page does: notices, quiet polling, and fields that are wrong are shown.
 
 export function notify(text, bad = false) {
     const notice = document.createElement("p");
@@ -28,3 +28,12 @@ document.addEventListener("htmx:after:swap", () => {
     lost?.remove();
     lost = null;
 });
+
+// A browser sends no form with a wrong field, and says so only beside the field: folds above it are opened for that.
+document.addEventListener("invalid", ({ target }) => {
+    for (let fold = target.closest("details"); fold; fold = fold.parentElement.closest("details")) fold.open = true;
+}, { capture: true });
+
+// A link to a view has it behind #, which no server hears of: a sign-in on the way hands it on.
+const next = document.querySelector(".sign-in [name=next]");
+if (next && location.hash) next.value += location.hash;

@@ -15,7 +15,12 @@ export function showEstimates(form, place, chosen) {
         const wrong = form.querySelector("input:invalid, select:invalid");
         if (wrong) return show(number, `${wrong.labels?.[0]?.textContent ?? wrong.id}: ${wrong.validationMessage}`);
         const { scene, dataset, queue } = chosen();
-        const body = { kind: form.getAttribute("data-kind"), options: readOptions(form), queue };
+        const body = { kind: form.getAttribute("data-kind"), queue };
+        try {
+            body.options = readOptions(form);
+        } catch (error) {
+            return show(number, error.message);
+        }
         if (scene) body.photographs = await sizesOf(scene);
         else if (dataset) body.dataset_id = dataset;
         if (!body.dataset_id && !body.photographs?.length) {

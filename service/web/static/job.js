@@ -2,7 +2,7 @@
 
 import { Charts, Training } from "./charts.js";
 import { comparison } from "./compare.js";
-import { thousands } from "./numbers.js";
+import { duration, thousands } from "./numbers.js";
 import "./table.js";
 import "./job_forms.js";
 
@@ -22,6 +22,13 @@ function redraw() {
 
 function refresh() {
     document.body.dispatchEvent(new CustomEvent("job-news"));
+}
+
+/** Loads the page again, as it has other parts by now; not while something is written, which would be gone. */
+function showAnew() {
+    const isWritten = [...document.querySelectorAll("input[type=text], textarea")].some((field) => field.value !== field.defaultValue && field.checkVisibility());
+    if (isWritten) setTimeout(showAnew, 1000);
+    else location.reload();
 }
 
 function showPreview({ step, view }) {
@@ -54,7 +61,7 @@ function showProgress(event) {
     bar.value = step;
     const left = event.seconds_left == null ? "" : ` · ${duration(event.seconds_left)} left`;
     const name = text.querySelector("b");
-    if (event.stage && name) name.textContent = event.stage;
+    if (event.stage && name) name.textContent = event.stage.replaceAll("_", " ");
     if (name) text.replaceChildren(name, ` ${thousands(step)}/${thousands(total)}${left}`);
     showDecibels("live-training-psnr", event.training_psnr);
     if (event.gaussians != null) document.getElementById("live-gaussians")?.replaceChildren(thousands(event.gaussians));
@@ -62,14 +69,6 @@ function showProgress(event) {
 
 function showDecibels(id, value) {
     if (value != null) document.getElementById(id)?.replaceChildren(value.toFixed(2), Object.assign(document.createElement("small"), { textContent: " dB" }));
-}
-
-function duration(seconds) {
-    const whole = Math.max(0, Math.round(seconds));
-    if (whole < 60) return `${whole} s`;
-    const minutes = Math.floor(whole / 60);
-    if (minutes < 60) return minutes < 10 && whole % 60 ? `${minutes} min ${whole % 60} s` : `${minutes} min`;
-    return `${Math.floor(minutes / 60)} h ${minutes % 60} min`;
 }
 
 /** Takes an event; `isNew` is false while the past is read. */
@@ -83,7 +82,7 @@ function hear(kind, data, id, isNew) {
         if (isNew) showDecibels("live-psnr", data.psnr);
     } else if (kind === "preview" && isNew && data.view) showPreview(data); // without a view it is a map of blocks
     else if (kind === "live_scene" && isNew) showLiveScene(data);
-    else if (kind === "state" && isNew && isOver(data.state)) location.reload();
+    else if (kind === "state" && isNew && isOver(data.state)) showAnew();
     else if (isNew) refresh();
 }
 
@@ -159,7 +158,7 @@ async function followLog() {
 
 document.addEventListener("job-changed", ({ detail }) => {
     // A retried job has a life ahead of it again.
-    if (isOver(about.dataset.state) !== isOver(detail.state)) location.reload();
+    if (isOver(about.dataset.state) !== isOver(detail.state)) showAnew();
 });
 const logFold = document.getElementById("log-fold");
 if (logFold.open) followLog();

@@ -11,6 +11,7 @@ const form = document.getElementById("new-job");
 const find = (id) => document.getElementById(id);
 const drop = find("drop"), known = find("dataset"), start = find("start"), pause = find("pause"), faults = find("faults");
 let scenes = null, upload = null, choice = 0; // several scenes become a job each
+let isStarting = false; // what was chosen is being sent, and nothing else can be chosen
 
 // By their attributes: a field of the form has the id "dataset".
 const kind = form.getAttribute("data-kind"), given = form.getAttribute("data-given");
@@ -48,12 +49,14 @@ function complain(text, sentences = []) {
     faults.focus();
 }
 
+/** Takes files, or the promise of them, unless others are chosen meanwhile. */
 async function choose(found) {
+    if (isStarting) return;
     faults.hidden = true;
     const number = ++choice;
     start.disabled = true;
     try {
-        const chosen = await scenesOf(found);
+        const chosen = await scenesOf(await found);
         if (number !== choice) return; // others have been chosen since
         scenes = chosen;
     } catch (error) {
@@ -109,10 +112,11 @@ for (const kind of ["dragenter", "dragover"]) {
     });
 }
 document.addEventListener("dragleave", (event) => { if (!event.relatedTarget) drop.classList.remove("over"); });
-document.addEventListener("drop", async (event) => {
+document.addEventListener("drop", (event) => {
+    if (![...event.dataTransfer.types].includes("Files")) return; // a word that is dropped on a field
     event.preventDefault();
     drop.classList.remove("over");
-    if (!upload) choose(await droppedFiles(event.dataTransfer));
+    choose(droppedFiles(event.dataTransfer));
 });
 find("forget").addEventListener("click", () => {
     choice += 1;
@@ -158,8 +162,23 @@ pause.addEventListener("click", () => {
 
 addEventListener("beforeunload", (event) => { if (upload) event.preventDefault(); });
 
+/** Nothing else is chosen or started while something is sent: leaving for its job would break off the other. */
+function setStarting(is) {
+    isStarting = is;
+    for (const control of [start, find("forget"), known, ...form.querySelectorAll("[data-pick]")]) {
+        if (control) control.disabled = is;
+    }
+}
+
+/** What a job is asked for besides its photographs. */
+function askedFor() {
+    const asked = { kind, options: readOptions(form), queue: find("queue")?.value ?? "cpu" };
+    if (find("begin-with")?.checked) asked.source_id = find("begin-with").value;
+    return asked;
+}
+
 /** Sends a scene, or takes the dataset that is chosen, and queues its job; returns that. */
-async function startOne(scene, label, isOneOfMany) {
+async function startOne(scene, asked, label, isOneOfMany) {
     let id = known?.value;
     if (scene) {
         paces.length = 0;
@@ -167,8 +186,7 @@ async function startOne(scene, label, isOneOfMany) {
         pause.hidden = false;
         id = (await upload.run()).id;
     }
-    const body = { kind, dataset_id: id, options: readOptions(form), queue: find("queue")?.value ?? "cpu" };
-    if (find("begin-with")?.checked) body.source_id = find("begin-with").value;
+    const body = { ...asked, dataset_id: id };
     if (label) body.label = isOneOfMany ? shortName(`${label}: ${scene.title}`) : label;
     return queueJob(body, `page-${id}-${Date.now()}`);
 }
@@ -180,11 +198,12 @@ form.addEventListener("submit", async (event) => {
         complain("Choose photographs first.");
         return;
     }
-    start.disabled = true;
+    setStarting(true);
     try {
-        const label = find("label").value.trim();
+        // Before anything is sent: what is wrong with it is told at once, and all of several jobs are asked for alike.
+        const asked = askedFor(), label = find("label").value.trim();
         const queued = [];
-        for (const scene of scenes ?? [null]) queued.push(await startOne(scene, label, scenes?.length > 1));
+        for (const scene of scenes ?? [null]) queued.push(await startOne(scene, asked, label, scenes?.length > 1));
         upload = null;
         location.href = queued.length > 1 ? "/" : `/jobs/${queued[0]}`;
     } catch (error) {
@@ -192,7 +211,7 @@ form.addEventListener("submit", async (event) => {
         complain(error.faults?.length ? "This cannot be used as it is:" : error.message, error.faults);
         find("going").hidden = true;
     } finally {
-        start.disabled = false;
+        setStarting(false);
         pause.hidden = true;
         pause.textContent = "Pause";
     }

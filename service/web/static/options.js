@@ -24,9 +24,17 @@ function valueOf(field) {
     if (field.dataset.type === "number") return Number(text);
     if (field.dataset.type === "yes_no") return text === "true";
     if (field.dataset.type === "numbers") return text.split(/[\s,]+/).map(Number);
-    if (field.dataset.type === "json") return JSON.parse(text);
+    if (field.dataset.type === "json") return jsonOf(text, field);
     if (field.dataset.type === "list") return text.split(",").map((part) => part.trim()).filter(Boolean);
     return text;
+}
+
+function jsonOf(text, field) {
+    try {
+        return JSON.parse(text);
+    } catch {
+        throw new Error(`${field.labels?.[0]?.textContent ?? field.dataset.path}: this is not JSON.`);
+    }
 }
 
 /** The names by which options know the files of a field; undefined where none was chosen. */
@@ -69,7 +77,9 @@ export function fillOptions(form, given) {
         const value = valueAt(field.dataset.path);
         if (value === undefined || value === null || field === preset || field.dataset.type.startsWith("upload")) continue;
         if (field.dataset.type === "files") {
-            for (const box of field.querySelectorAll("input")) box.checked = value.includes(box.value) && !box.disabled;
+            const boxes = [...field.querySelectorAll("input")];
+            for (const box of boxes) box.checked = value.includes(box.value) && !box.disabled;
+            field.append(...value.filter((name) => !boxes.some((box) => box.value === name)).map(boxFor));
             continue;
         }
         const defaults = field.dataset.defaults ? JSON.parse(field.dataset.defaults) : {};
@@ -78,6 +88,15 @@ export function fillOptions(form, given) {
         const shown = field.dataset.type === "yes_no" ? (value ? "yes" : "no") : text;
         if (shown !== String(usual) && text !== "") field.value = text;
     }
+}
+
+/** A box for a file that the form does not offer by itself: formats can have other names. */
+function boxFor(name) {
+    const label = Object.assign(document.createElement("label"), { className: "check" });
+    const span = document.createElement("span");
+    span.append(Object.assign(document.createElement("b"), { textContent: name }));
+    label.append(Object.assign(document.createElement("input"), { type: "checkbox", value: name, checked: true }), span);
+    return label;
 }
 
 function textOf(type, value) {
@@ -99,7 +118,7 @@ export async function queueJob(body, key) {
 /** The JSON of an answer, or an error with the problem's words. */
 export async function answer(response) {
     if (response.ok) return response.json();
-    if (response.status === 401) location.href = `/sign-in?next=${encodeURIComponent(location.pathname)}`;
+    if (response.status === 401) location.href = `/sign-in?next=${encodeURIComponent(location.pathname + location.search + location.hash)}`;
     const problem = await response.json().catch(() => ({}));
     const error = new Error(problem.detail ?? `The service answered ${response.status}.`);
     error.status = response.status;

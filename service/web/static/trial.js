@@ -41,8 +41,9 @@ export class Trials {
         this.section.setAttribute("aria-busy", "true");
         try {
             mine.id = await queue();
-            if (await this.finished(mine)) {
-                await this.showPicture(mine.id, `Preview of ${name} ${what}`, `${name}, ${about}`);
+            const picture = await this.finished(mine) && await this.picture(mine.id);
+            if (picture && mine === this.newest) {
+                this.showPicture(picture, `Preview of ${name} ${what}`, `${name}, ${about}`);
                 this.say(`The preview took ${Math.round((performance.now() - began) / 1000)} s.`);
             }
         } catch (error) {
@@ -70,10 +71,16 @@ export class Trials {
         }
     }
 
-    async showPicture(id, alt, caption) {
+    /** The picture that a job made. */
+    async picture(id) {
         const { artifacts } = await api(`${id}/artifacts`).then(answer);
         const found = artifacts.find((artifact) => artifact.name.endsWith(".png"));
-        const content = await (await api(`${id}/artifacts/${found.name.split("/").map(encodeURIComponent).join("/")}`)).blob();
+        if (!found) throw new Error("The preview made no picture.");
+        const response = await api(`${id}/artifacts/${found.name.split("/").map(encodeURIComponent).join("/")}`);
+        return response.ok ? response.blob() : answer(response);
+    }
+
+    showPicture(content, alt, caption) {
         const figure = this.section.querySelector("figure.preview"), image = figure.querySelector("img");
         if (image.src) URL.revokeObjectURL(image.src);
         image.src = URL.createObjectURL(content);
@@ -87,7 +94,7 @@ export class Trials {
 async function forget(id) {
     for (let tries = 0; tries < 10; tries++) {
         const gone = await api(`${id}?cancel=true`, "DELETE").catch(() => null);
-        if (gone && gone.status !== 409) return;
+        if (gone && (gone.ok || [401, 403, 404].includes(gone.status))) return;
         await new Promise((resolve) => setTimeout(resolve, 2000));
     }
 }

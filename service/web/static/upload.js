@@ -99,7 +99,11 @@ export class Upload {
     async removeOthers(id, arrived, items) {
         const wanted = new Set(items.map(({ name }) => name));
         for (const name of arrived.keys()) {
-            if (!wanted.has(name)) await this.again(() => fetch(address(id, name), { method: "DELETE" }));
+            if (wanted.has(name)) continue;
+            await this.again(async () => {
+                const response = await fetch(address(id, name), { method: "DELETE" });
+                if (!response.ok && response.status !== 404) await answer(response); // it would be trained on
+            });
         }
     }
 

@@ -21,6 +21,7 @@ const picture = find(".spot-picture"), spot = find(".spot");
 const trials = new Trials(section);
 const sent = new SentFiles("stage", Number(section.dataset.maxFile), (words) => trials.say(words));
 let cameras = null, extent = 1, text = "", link = null;
+let measured = Promise.resolve(); // once the extent is that of the mesh
 let asking = 0, latest = 0; // for estimates
 
 const chosen = () => form.elements.view.selectedOptions[0];
@@ -60,10 +61,19 @@ async function showEstimates() {
     const [views, turntable] = await Promise.all(Object.values(WHAT).map(async (options) => {
         const body = { kind: "render", source_id: source, queue, options: { ...options, stage: text } };
         const response = await fetch("/v1/estimates", { method: "POST", headers, body: JSON.stringify(body) }).catch(() => null);
-        const told = await response?.json().catch(() => null);
-        return told?.estimate?.text ?? told?.errors?.[0]?.detail ?? "";
+        return await response?.json().catch(() => null);
     }));
-    if (number === latest && views) find(".light-estimate").textContent = `With 100,000 Gaussians the held-out views would take at most ${views}, a turntable of ${TURN.frames} frames ${turntable}; fewer are faster.`;
+    if (number !== latest) return;
+    const fault = [views, turntable].map((told) => told?.errors?.[0]?.detail ?? "").find(Boolean) ?? "";
+    find(".light-estimate").textContent = views?.estimate && turntable?.estimate
+        ? `With 100,000 Gaussians the held-out views would take at most ${views.estimate.text}, a turntable of ${TURN.frames} frames ${turntable.estimate.text}; fewer are faster.`
+        : fault;
+}
+
+/** Options with the stage, once it is known how large the mesh is. */
+async function staged(options, samples) {
+    for (let waited = null; waited !== measured;) await (waited = measured);
+    return { ...options, stage: stage(samples) };
 }
 
 /** The files of the stage as a dataset, sent once; null where it names none. */
@@ -85,16 +95,16 @@ async function queueRender(options, more = {}) {
 /** One small picture with few samples. */
 function preview() {
     const view = chosen().value;
-    const options = { mode: "views", photographs: [view], format: "png", max_side: PREVIEW.side, stage: stage(PREVIEW.samples) };
+    const options = { mode: "views", photographs: [view], format: "png", max_side: PREVIEW.side };
     const about = `${PREVIEW.samples} samples a pixel; a render has no such grain.`;
-    trials.show(() => queueRender(options, { priority: Number(priority), label: "preview of light" }), view, "with the stage", about);
+    trials.show(async () => queueRender(await staged(options, PREVIEW.samples), { priority: Number(priority), label: "preview of light" }), view, "with the stage", about);
 }
 
 async function render(options, button) {
     trials.complain("");
     button.disabled = true;
     try {
-        const id = await queueRender({ ...options, stage: stage() });
+        const id = await queueRender(await staged(options));
         location.href = `/jobs/${id}`;
     } catch (error) {
         trials.say("");
@@ -118,10 +128,14 @@ form.elements.view.addEventListener("change", () => {
     picture.src = chosen().dataset.render;
     picture.alt = `The scene as ${chosen().value} sees it`;
 });
-async function takeMesh() {
+function takeMesh() {
     const file = form.elements.mesh.files[0];
-    extent = file ? await meshExtent(file) : 1;
-    show();
+    const reading = file ? meshExtent(file) : Promise.resolve(1);
+    measured = reading.then((found) => {
+        if (file !== form.elements.mesh.files[0]) return; // another one has been chosen since
+        extent = found;
+        show();
+    });
 }
 form.elements.mesh.addEventListener("change", takeMesh);
 for (const kind of ["dragover", "drop"]) {

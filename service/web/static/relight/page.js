@@ -74,29 +74,39 @@ async function liveFile() {
     return response.arrayBuffer();
 }
 
-/** Shows the light in the 3D view: all of it, or only that it was turned. */
-async function showLive(anew) {
-    const { live, rotation_degrees } = fieldValues(form);
-    const degrees = live === "this" ? rotation_degrees : 0;
+let newest = 0; // light that was chosen; that of one before may still be on its way
+
+/** Shows the light in the 3D view. */
+async function showLive() {
+    const number = ++newest, { live } = fieldValues(form);
     trials.complain("");
     try {
-        const map = !live ? null : anew ? readHdr(await liveFile()) : undefined;
-        viewer.dispatchEvent(new CustomEvent("light", { detail: { map, degrees } }));
-        if (anew) section.dataset.live = live || "none";
+        const map = live ? readHdr(await liveFile()) : null;
+        if (number !== newest) return;
+        turnLive(map);
+        section.dataset.live = live || "none";
     } catch (error) {
+        if (number !== newest) return;
         form.elements.live.value = "";
+        section.dataset.live = "none";
         viewer.dispatchEvent(new CustomEvent("light", { detail: { map: null, degrees: 0 } }));
         trials.complain(sentences(error));
     }
+}
+
+/** Turns the light in the 3D view as the form says by now, or shows another one. */
+function turnLive(map) {
+    const { live, rotation_degrees } = fieldValues(form);
+    viewer.dispatchEvent(new CustomEvent("light", { detail: { map, degrees: live === "this" ? rotation_degrees : 0 } }));
 }
 
 const viewer = document.getElementById("viewer");
 const offerLive = () => { form.elements.live.closest(".field").hidden = false; };
 if (viewer?.dataset.materials) offerLive();
 else viewer?.addEventListener("materials", offerLive);
-form.elements.live.addEventListener("change", () => showLive(true));
-for (const name of ["map", "file"]) form.elements[name].addEventListener("change", () => { if (form.elements.live.value === "this") showLive(true); });
-form.elements.rotation_degrees.addEventListener("input", () => { if (form.elements.live.value === "this") showLive(false); });
+form.elements.live.addEventListener("change", showLive);
+for (const name of ["map", "file"]) form.elements[name].addEventListener("change", () => { if (form.elements.live.value === "this") showLive(); });
+form.elements.rotation_degrees.addEventListener("input", () => { if (section.dataset.live === "this") turnLive(); });
 
 const show = () => showFields(form, (needs) => holds(needs, fieldValues(form)));
 form.addEventListener("input", show);

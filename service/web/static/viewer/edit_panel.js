@@ -53,7 +53,7 @@ export class EditPanel {
     showNumbers() {
         for (const output of this.form.querySelectorAll("output")) {
             const input = document.getElementById(output.htmlFor.value), axis = "xyz".indexOf(input.name[0]);
-            output.textContent = (Number(input.value) + this.origin[axis]).toPrecision(4);
+            output.textContent = (Number(input.value) + this.origin[axis]).toFixed(decimalsOf(Number(input.step)));
         }
     }
 
@@ -74,12 +74,14 @@ export class EditPanel {
         const { box, clean } = this.wanted();
         this.form.querySelector(".box-sliders").hidden = !box;
         this.form.querySelector(".clean-fields").hidden = !clean;
+        // What is not asked for keeps nothing from being asked for, whatever it says.
+        this.form.querySelectorAll(".clean-fields input").forEach((field) => { field.disabled = !clean; });
         this.form.querySelector("[value=crop]").disabled = !box;
         this.form.querySelector("[value=clean]").disabled = !clean;
         const region = this.form.querySelector("#edit-region"); // not there for results of other jobs
         if (region) {
             region.hidden = !box;
-            if (box) region.href = `${region.dataset.new}#region=${this.inFile(box).map((value) => value.toPrecision(5)).join(",")}`;
+            if (box) region.href = `${region.dataset.new}#region=${this.inText(box).join(",")}`;
         }
         this.viewer.overlay.box = box;
         this.showNumbers();
@@ -89,7 +91,11 @@ export class EditPanel {
     ask() {
         const { box, clean } = this.wanted(), isOpen = this.panel.open && (box || clean);
         this.viewer.overlay.box = isOpen ? box : null;
-        if (isOpen && !this.form.checkValidity()) return;
+        const wrong = isOpen && this.form.querySelector("input:invalid");
+        if (wrong) {
+            this.state.textContent = `${wrong.labels[0].textContent}: ${wrong.validationMessage}`;
+            return;
+        }
         if (isOpen) this.state.textContent = "Looking …";
         this.viewer.edit(isOpen ? { box, clean } : { box: null, clean: null }, isOpen ? this.show : "all");
     }
@@ -99,21 +105,37 @@ export class EditPanel {
         return box.map((value, k) => value + this.origin[k % 3]);
     }
 
-    tell({ counts, kept }) {
+    /** The same as text, each number as fine as its slider moves, however far the scene is from the origin. */
+    inText(box) {
+        const step = (k) => Number(this.form.elements[`${"xyz"[k % 3]}_low`].step);
+        return this.inFile(box).map((value, k) => value.toFixed(decimalsOf(step(k) / 10)));
+    }
+
+    tell({ counts, kept, error }) {
+        if (error) {
+            this.state.textContent = `What this would do cannot be shown here (${error}); a job can do it.`;
+            return;
+        }
         const reasons = Object.entries(counts).filter(([, number]) => number).map(([reason, number]) => `${thousands(number)} ${WORDS[reason]}`);
         this.state.textContent = `${thousands(kept)} Gaussians stay${reasons.length ? `; ${reasons.join(", ")}` : ""}.`;
         this.viewer.box.dataset.edited = JSON.stringify({ ...counts, kept });
     }
 
     async queue(kind) {
+        if (this.isQueuing) return; // pressed twice, there would be two jobs
         const { box, clean } = this.wanted(), fault = this.form.querySelector(".fault");
-        fault.hidden = true;
+        fault.hidden = this.isQueuing = true;
         const options = kind === "crop" ? { box: this.inFile(box) } : clean;
         try {
             location.href = `/jobs/${await queueJob({ kind, source_id: this.source, options }, crypto.randomUUID?.() ?? String(Math.random()))}`;
         } catch (error) {
             fault.textContent = [error.message, ...(error.faults ?? [])].join(" ");
-            fault.hidden = false;
+            fault.hidden = this.isQueuing = false;
         }
     }
+}
+
+/** Digits behind the point that tell one step of a slider from the next. */
+function decimalsOf(step) {
+    return Math.min(20, Math.max(0, Math.ceil(-Math.log10(step))));
 }

@@ -16,7 +16,8 @@ export function readHdr(buffer) {
     const bytes = new Uint8Array(buffer);
     const text = new TextDecoder("latin1").decode(bytes.subarray(0, 1 << 12));
     const size = /\n\n-Y (\d+) \+X (\d+)\n/.exec(text);
-    if (!text.startsWith("#?") || !size) throw new Error("The 3D view takes light from Radiance HDR files only.");
+    const isOther = /^FORMAT=(?!32-bit_rle_rgbe$)/m.test(text.slice(0, size?.index)); // such as XYZ colors
+    if (!text.startsWith("#?") || !size || isOther) throw new Error("The 3D view takes light from Radiance HDR files only.");
     const height = Number(size[1]), width = Number(size[2]);
     if (width > MAX_SIDE || height > MAX_SIDE) throw new Error("This map is too large for the 3D view.");
     const data = new Float32Array(3 * width * height), row = new Uint8Array(4 * width);

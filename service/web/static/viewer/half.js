@@ -11,10 +11,11 @@ export function toHalf(value) {
     const exponent = (bits >>> 23) & 0xff;
     const mantissa = bits & 0x7fffff;
     if (exponent < 103) return sign;
-    if (exponent > 141) return sign | 0x7bff;
+    if (exponent > 142) return sign | 0x7bff;
     if (exponent < 113) {
         const shift = 126 - exponent;
         return sign | (((mantissa | 0x800000) + (1 << (shift - 1))) >>> shift);
     }
-    return sign | (((exponent - 112) << 10) + ((mantissa + 0x1000) >>> 13));
+    // Rounded up, the largest would be infinite.
+    return sign | Math.min(0x7bff, ((exponent - 112) << 10) + ((mantissa + 0x1000) >>> 13));
 }

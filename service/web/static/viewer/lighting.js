@@ -42,6 +42,18 @@ export class Lighting {
         }));
     }
 
+    /** Takes over the map of another one, and how that lies. */
+    takeOver(other) {
+        for (const name of [...LEVELS, "right", "up", "forward"]) this.uniforms[name].value = other.uniforms[name].value;
+    }
+
+    /** Frees what is its own; the map may have been taken over. */
+    dispose() {
+        const { materialTexture } = this.octagons.children[0].material.uniforms;
+        const own = [this.target, this.uniforms.table.value, materialTexture.value, this.octagons.children[0].material];
+        for (const owned of own) owned.dispose();
+    }
+
     /** Takes a map as of environment.js. */
     setMap(map) {
         levelsOf(map).forEach((level, k) => {

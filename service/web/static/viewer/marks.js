@@ -30,7 +30,10 @@ export class Marks {
             event.preventDefault();
             this.keep();
         });
-        this.form.querySelector("[data-do=note-cancel]").addEventListener("click", () => { this.form.hidden = true; });
+        this.form.querySelector("[data-do=note-cancel]").addEventListener("click", () => {
+            this.form.hidden = true;
+            canvas.focus({ preventScroll: true });
+        });
         this.showNotes();
     }
 
@@ -48,6 +51,7 @@ export class Marks {
     async take(x, y) {
         const { overlay, place, box } = this.viewer;
         const mode = this.mode, point = await this.viewer.pick(x, y);
+        if (mode !== this.mode) return; // something else is wanted since
         if (!point) {
             place.textContent = "Nothing is there.";
             return;
@@ -71,13 +75,17 @@ export class Marks {
 
     async keep() {
         const { camera, controls } = this.viewer;
-        const input = this.form.querySelector("input");
+        const input = this.form.querySelector("input"), button = this.form.querySelector("[type=submit]");
+        if (button.disabled || !input.value.trim()) return;
+        button.disabled = true; // pressed twice, it would be kept twice
         const note = { text: input.value.trim(), position: this.point, camera: [...camera.position.toArray(), ...controls.target.toArray()] };
-        if (await this.store((notes) => [...notes, note])) {
-            input.value = "";
-            this.form.hidden = true;
-            this.toggle("note");
-        }
+        const isKept = await this.store((notes) => [...notes, note]);
+        button.disabled = false;
+        if (!isKept) return;
+        input.value = "";
+        this.form.hidden = true;
+        if (this.mode === "note") this.toggle("note");
+        this.viewer.canvas.focus({ preventScroll: true });
     }
 
     /** Changes the notes that the job has by now: others may have written some since this page was loaded. */

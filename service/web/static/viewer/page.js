@@ -16,6 +16,7 @@ import { LoadingViewer } from "./loading_viewer.js";
 
 const MAX_PIXEL_RATIO = 2;
 const REST_MS = 150;
+const CAMERA_TRIES = 3, CAMERA_PAUSE_MS = 500;
 const BACKGROUNDS = { black: [0, 0, 0], white: [1, 1, 1] };
 
 class Viewer extends LoadingViewer {
@@ -53,7 +54,7 @@ class Viewer extends LoadingViewer {
         this.say("Loading the scene");
         this.isLoading = true;
         try {
-            this.splats = new SplatRenderer(this.canvas);
+            this.splats ??= new SplatRenderer(this.canvas); // another scene may have failed before
         } catch {
             this.fail(new Error("This browser has no WebGL 2, so the scene cannot be shown here; the downloads open elsewhere."));
             return;
@@ -75,13 +76,20 @@ class Viewer extends LoadingViewer {
         const worker = new Worker(new URL("./scene_worker.js", import.meta.url), { type: "module" });
         worker.addEventListener("message", ({ data }) => this.hear(data));
         return new Promise((resolve, reject) => {
-            worker.onerror = () => reject(new Error("The scene cannot be loaded."));
+            const give = (error) => {
+                worker.terminate(); // and what it has loaded so far
+                reject(error);
+            };
+            worker.onerror = () => give(new Error("The scene cannot be loaded."));
             worker.onmessage = ({ data }) => {
                 if (data.scene) {
                     this.worker?.terminate();
                     this.worker = worker;
+                    worker.onerror = null;
+                    this.picks.forEach((found) => found(null)); // which nobody answers any more
+                    this.picks.clear();
                     resolve(data.scene);
-                } else if (data.error) reject(new Error(data.error));
+                } else if (data.error) give(new Error(data.error));
                 else if (data.total) {
                     bar.max = data.total;
                     bar.value = data.loaded;
@@ -142,16 +150,39 @@ class Viewer extends LoadingViewer {
     endLoading(loaded) {
         this.isLoading = false;
         const { scene, count } = this.box.dataset;
-        if (this.frame && scene !== loaded) this.renew({ scene, count });
+        if (scene !== loaded) this.renew({ scene, count }); // also where the one before could not be shown
+    }
+
+    /** The device has taken back its graphics memory, as phones do while another page is looked at. */
+    lose() {
+        this.isLost = true;
+        this.veil.hidden = false;
+        this.veil.querySelector("progress").hidden = true;
+        this.say("The graphics of this device have stopped; the scene comes back with them.");
+    }
+
+    async restore() {
+        try {
+            await this.splats.setScene(this.scene, this.q);
+        } catch (error) {
+            this.fail(error);
+            return;
+        }
+        this.isLost = false;
+        this.sorting.forget();
+        this.wake();
     }
 
     async loadCameras() {
-        try {
-            const response = await fetch(this.box.dataset.cameras);
-            return response.ok ? await response.json() : { views: [] };
-        } catch {
-            return { views: [] };
+        for (let left = CAMERA_TRIES; left > 0; left -= 1) {
+            try {
+                const response = await fetch(this.box.dataset.cameras);
+                if (response.ok) return await response.json();
+                if (response.status < 500 && response.status !== 429) break;
+            } catch { /* the connection may be back soon */ }
+            await new Promise((resolve) => setTimeout(resolve, CAMERA_PAUSE_MS));
         }
+        return { views: [], isLost: true };
     }
 
     setUp(scene, cameras) {
@@ -169,13 +200,15 @@ class Viewer extends LoadingViewer {
         tools.querySelector(".views").addEventListener("change", ({ target }) => target.value && this.do("view", Number(target.value)));
         tools.querySelector("[data-do=full]").hidden = !document.fullscreenEnabled;
         this.splats.setBackground(...BACKGROUNDS[this.background]);
+        this.canvas.addEventListener("webglcontextlost", () => this.lose());
+        this.canvas.addEventListener("webglcontextrestored", () => this.restore());
         this.takeLight();
         new ResizeObserver(() => this.resize()).observe(this.canvas.parentElement);
         this.resize();
         this.marks = new Marks(this);
         this.setScene(scene, cameras);
         this.do("reset");
-        this.place.textContent = "";
+        this.place.textContent = cameras.isLost ? "The places of the photographs could not be loaded." : "";
         this.followLink();
         addEventListener("hashchange", () => this.followLink());
         const panel = document.getElementById("edit");
@@ -194,7 +227,7 @@ class Viewer extends LoadingViewer {
             this.isStale = true;
             this.added = null;
             Object.assign(this.box.dataset, { ready: "yes", drawn: "part" });
-            this.veil.hidden = true;
+            this.veil.hidden = !this.isLost;
         });
         this.scene = scene;
         this.box.querySelector(".count").textContent = this.box.dataset.count || `${thousands(scene.count)} Gaussians`;
@@ -219,11 +252,11 @@ class Viewer extends LoadingViewer {
     /** Goes to the view that the address names. */
     followLink() {
         const view = viewOf(location.hash);
-        if (view) this.goTo(view.position, new Vector3().fromArray(view.target), view.fovY);
+        if (view) this.goTo(view.position, new Vector3().fromArray(view.target), view.fovY, view.aspect);
     }
 
     async copyLink() {
-        const hash = linkOf(this.camera.position.toArray(), this.controls.target.toArray(), this.fovY);
+        const hash = linkOf(this.camera.position.toArray(), this.controls.target.toArray(), this.fovY, this.aspect);
         history.replaceState(null, "", hash);
         try {
             await navigator.clipboard.writeText(location.href);
@@ -233,10 +266,10 @@ class Viewer extends LoadingViewer {
         }
     }
 
-    goTo(position, target, fovY = this.fovY) {
+    goTo(position, target, fovY = this.fovY, aspect = this.aspect) {
         this.do("orbit");
         this.view = -1;
-        this.lookFrom(position, target, fovY, this.aspect ?? 1);
+        this.lookFrom(position, target, fovY, aspect);
         this.photograph.leave();
         this.wake();
     }
@@ -295,7 +328,7 @@ class Viewer extends LoadingViewer {
 
     stepView(step) {
         const count = this.frame.views.length;
-        if (count) this.showView((this.view + step + count) % count);
+        if (count) this.showView(this.view < 0 ? (step > 0 ? 0 : count - 1) : (this.view + step + count) % count);
     }
 
     showView(index) {
@@ -354,7 +387,7 @@ class Viewer extends LoadingViewer {
         if (this.limits.clamp(this.camera.position) && !this.walking.flying) this.camera.lookAt(this.controls.target);
         // Once for each change: a page that changes in every frame leaves a software renderer no time for the scene.
         if (this.isOverlayStale) this.drawOverlay();
-        if (this.isBusy || !this.isStale) return;
+        if (this.isBusy || this.isLost || !this.isStale) return;
         this.camera.updateMatrixWorld();
         if (performance.now() - this.movedAt < REST_MS) this.drawMoving();
         else this.drawResting();
@@ -366,6 +399,7 @@ class Viewer extends LoadingViewer {
             this.leavesAt = null;
             this.overlay.chosen = -1;
             this.photograph.leave();
+            this.box.querySelector(".views").value = ""; // so that it can be chosen again
         }
         this.overlay.draw(this.camera);
         this.isOverlayStale = false;

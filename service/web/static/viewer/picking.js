@@ -10,10 +10,10 @@ const LEAST_SHARE = 0.05; // of the light; what stops less cannot be meant
  */
 export function pick({ count, geometry }, origin, direction, q, hidden = null) {
     const hits = [];
-    const reach = Math.sqrt(q);
     for (let i = 0; i < count; i++) {
         if (hidden?.[i]) continue;
-        const g = 12 * i;
+        const g = 12 * i, limit = q + 2 * Math.log(geometry[g + 3]); // as shaders.js draws it
+        if (!(limit > 0)) continue;
         const ax = geometry[g + 4], ay = geometry[g + 5], az = geometry[g + 6], bx = geometry[g + 8], by = geometry[g + 9], bz = geometry[g + 10];
         const nx = ay * bz - az * by, ny = az * bx - ax * bz, nz = ax * by - ay * bx;
         const slope = nx * direction[0] + ny * direction[1] + nz * direction[2];
@@ -24,7 +24,7 @@ export function pick({ count, geometry }, origin, direction, q, hidden = null) {
         const px = t * direction[0] - mx, py = t * direction[1] - my, pz = t * direction[2] - mz;
         const u = (px * ax + py * ay + pz * az) / (ax * ax + ay * ay + az * az), v = (px * bx + py * by + pz * bz) / (bx * bx + by * by + bz * bz);
         const squared = u * u + v * v;
-        if (!(squared < q) || !isInOctagon(u, v, reach)) continue;
+        if (!(squared < limit) || !isInOctagon(u, v, Math.sqrt(limit))) continue;
         hits.push([t, geometry[g + 3] * Math.exp(-0.5 * squared)]);
     }
     hits.sort((one, other) => one[0] - other[0]);

@@ -1,7 +1,7 @@
 // Loads a scene and keeps it in order, beside the page: {load, views}, then {position, forward, reach, order,
 // limit} again and again; answers are {loaded, total}, {scene}, {order, count, limit} or {error}. Besides,
 // {pick: {origin, direction, q}, id} is answered by {picked, id}, and {edit, show} by {edited}: what crop and
-// clean would remove is left out of the order, or with the show "removed" all the rest.
+// clean would remove is left out of the order, or with the show "removed" all the rest; nothing where that fails.
 
 import { removedBy } from "./cleaning.js";
 import { pick } from "./picking.js";
@@ -66,9 +66,14 @@ async function load(url, views) {
 }
 
 function edit(wanted, show) {
-    const { removed, counts, kept } = removedBy(scene, scene.views, wanted);
-    hidden = show === "all" ? null : show === "removed" ? removed.map((mark) => 1 - mark) : removed;
-    postMessage({ edited: { counts, kept } });
+    try {
+        const { removed, counts, kept } = removedBy(scene, scene.views, wanted);
+        hidden = show === "all" ? null : show === "removed" ? removed.map((mark) => 1 - mark) : removed;
+        postMessage({ edited: { counts, kept } });
+    } catch (error) { // as where the memory for a large scene is lacking
+        hidden = null;
+        postMessage({ edited: { error: error.message } });
+    }
 }
 
 onmessage = ({ data }) => {

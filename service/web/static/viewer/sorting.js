@@ -4,6 +4,9 @@ const BUCKETS = 1 << 16;
 const MAX_JUDGES = 64;
 const MIN_SHARE_OF_VIEWS = 0.03;
 const MAX_HIDDEN_SHARE = 0.6;
+const SHARE_OF_USUAL = 0.1; // of the photographs that show a Gaussian of the middle by their number
+const LEAST_USUAL = 8; // where that are fewer of the known ones, they say nothing of single Gaussians
+const MAX_SAMPLES = 1000;
 const FRAME_MARGIN = 1.1;
 
 /**
@@ -65,35 +68,54 @@ export function makeSorter({ count, geometry, bounds, views = [], shown = shownB
     };
 }
 
-/** For each Gaussian 1 where enough photographs have its middle in their frame, else 0. */
+/**
+ * For each Gaussian 1 where enough photographs have its middle in their frame, else 0. Some of many photographs
+ * judge first; all of them judge what these do not see, as each shows but a small part of a large scene.
+ */
 export function shownBy(count, geometry, views) {
     const shown = new Uint8Array(count).fill(1);
+    const every = views.map((view) => frameOfView(view, FRAME_MARGIN));
     const step = Math.max(1, Math.ceil(views.length / MAX_JUDGES));
-    const judges = views.filter((_view, k) => k % step === 0).map((view) => frameOfView(view, FRAME_MARGIN));
+    const judges = every.filter((_frame, k) => k % step === 0);
     if (judges.length < 3) return shown;
+    const votes = (frames, i, most = Infinity) => {
+        let sum = 0;
+        for (let v = 0; v < frames.length && sum < most; v++) sum += isInFrame(frames[v], geometry[12 * i], geometry[12 * i + 1], geometry[12 * i + 2]) ? 1 : 0;
+        return sum;
+    };
     const least = Math.max(2, MIN_SHARE_OF_VIEWS * judges.length);
+    let leastOfAll = Infinity;
+    if (step > 1) {
+        const usual = usualOf(count, (i) => votes(every, i));
+        if (usual < LEAST_USUAL) return shown;
+        leastOfAll = Math.max(2, Math.min(MIN_SHARE_OF_VIEWS * every.length, SHARE_OF_USUAL * usual));
+    }
     let hidden = 0;
     for (let i = 0; i < count; i++) {
-        const g = 12 * i;
-        let votes = 0;
-        for (let v = 0; v < judges.length && votes < least; v++) votes += isInFrame(judges[v], geometry[g], geometry[g + 1], geometry[g + 2]) ? 1 : 0;
-        if (votes < least) {
-            shown[i] = 0;
-            hidden += 1;
-        }
+        if (votes(judges, i, least) >= least || (step > 1 && votes(every, i, leastOfAll) >= leastOfAll)) continue;
+        shown[i] = 0;
+        hidden += 1;
     }
     return hidden > MAX_HIDDEN_SHARE * count ? shown.fill(1) : shown;
 }
 
-/** The image of a view as of cameras.json, `margin` times as large. */
-export function frameOfView({ position, forward, up, fov_y_degrees: fovY, aspect }, margin) {
+/** The median of a number of Gaussians, from some of them. */
+function usualOf(count, numberOf) {
+    const step = Math.max(1, Math.floor(count / MAX_SAMPLES));
+    const numbers = Array.from({ length: Math.ceil(count / step) }, (_, k) => numberOf(k * step)).sort((a, b) => a - b);
+    return numbers[numbers.length >> 1] ?? 0;
+}
+
+/** The image of a view as of cameras.json, `margin` times as large; a panorama shows everything. */
+export function frameOfView({ position, forward, up, fov_y_degrees: fovY, aspect, panorama = false }, margin) {
     const right = [forward[1] * up[2] - forward[2] * up[1], forward[2] * up[0] - forward[0] * up[2], forward[0] * up[1] - forward[1] * up[0]];
     const tangent = Math.tan((fovY * Math.PI) / 360) * margin;
-    return { position, forward, up, right, y: tangent, x: tangent * aspect };
+    return { position, forward, up, right, y: tangent, x: tangent * aspect, panorama };
 }
 
 /** Whether a point lies in such an image. */
-export function isInFrame({ position: p, forward: f, up: u, right: r, x, y }, a, b, c) {
+export function isInFrame({ position: p, forward: f, up: u, right: r, x, y, panorama }, a, b, c) {
+    if (panorama) return true;
     const dx = a - p[0], dy = b - p[1], dz = c - p[2];
     const depth = dx * f[0] + dy * f[1] + dz * f[2];
     return depth > 0 && Math.abs(dx * r[0] + dy * r[1] + dz * r[2]) < x * depth && Math.abs(dx * u[0] + dy * u[1] + dz * u[2]) < y * depth;

@@ -62,7 +62,12 @@ export class SplatRenderer {
         const materials = await this.upload(scene.materials, scene.count, 2, HalfFloatType);
         const { geometryTexture, geometryColumns, q: radius } = this.mesh.material.uniforms;
         const uniforms = { geometryTexture, geometryColumns, q: radius, materialTexture: { value: materials.texture }, materialColumns: { value: materials.columns } };
+        const before = this.lighting;
         this.lighting = new Lighting(this.mesh.geometry, uniforms, fullScreen);
+        if (before) {
+            this.lighting.takeOver(before);
+            before.dispose();
+        }
         this.lighting.uniforms.background.value = this.background;
     }
 

@@ -4,8 +4,16 @@ import { Vector3 } from "../vendor/three.js";
 
 const TURN_PER_SECOND = 1.1;
 const LOOK_PER_PIXEL = 0.004;
-const ACTIONS = { KeyN: "next", KeyP: "previous", KeyR: "reset", KeyF: "toggle-fly", KeyB: "background", KeyK: "key", KeyC: "cameras", KeyM: "measure" };
+const ACTIONS = { n: "next", p: "previous", r: "reset", f: "toggle-fly", b: "background", k: "key", c: "cameras", m: "measure" };
 const HELD = new Set(["KeyW", "KeyA", "KeyS", "KeyD", "KeyQ", "KeyE", "ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", "Equal", "Minus", "NumpadAdd", "NumpadSubtract"]);
+
+const BY_SIGN = { "+": "Equal", "=": "Equal", "-": "Minus", "\u2212": "Minus" };
+
+/** What a key that is held does: those that lie as W A S D go by their place, others by what is on them. */
+const heldName = ({ key, code }) => BY_SIGN[key] ?? (HELD.has(code) ? code : null);
+
+/** What a key that is pressed does: by its letter, or where that is no Latin one, by its place. */
+const actionOf = ({ key, code }) => ACTIONS[(/^[a-z]$/i.test(key) ? key : code.replace(/^Key/, "")).toLowerCase()];
 
 /** Moves a camera by keys, and turns it on the spot by dragging while it flies. */
 export class Walking {
@@ -13,6 +21,7 @@ export class Walking {
         Object.assign(this, { canvas, camera, controls, radius, wake });
         this.flying = false;
         this.keys = new Set();
+        this.names = new Map(); // of what is held, by the key that holds it
         // A tap that is shorter than a frame counts as well: its key goes with the next step.
         this.fresh = new Set();
         this.tapped = new Set();
@@ -21,17 +30,20 @@ export class Walking {
         canvas.addEventListener("keydown", (event) => {
             if (event.ctrlKey || event.metaKey || event.altKey) return;
             this.fast = event.shiftKey;
-            if (HELD.has(event.code)) {
-                if (!this.keys.has(event.code)) this.fresh.add(event.code);
-                this.keys.add(event.code);
+            const held = heldName(event), action = actionOf(event);
+            if (held) {
+                if (!this.keys.has(held)) this.fresh.add(held);
+                this.keys.add(held);
+                this.names.set(event.code, held);
                 event.preventDefault();
                 wake();
-            } else if (event.code in ACTIONS && !event.repeat) act(ACTIONS[event.code]);
+            } else if (action && !event.repeat) act(action);
         });
         canvas.addEventListener("keyup", (event) => {
             this.fast = event.shiftKey;
-            if (this.fresh.has(event.code)) this.tapped.add(event.code);
-            else this.keys.delete(event.code);
+            const held = this.names.get(event.code);
+            if (this.fresh.has(held)) this.tapped.add(held);
+            else this.keys.delete(held);
         });
         canvas.addEventListener("blur", () => [this.keys, this.fresh, this.tapped].forEach((keys) => keys.clear()));
         canvas.addEventListener("pointermove", (event) => this.drag(event));
