@@ -127,6 +127,15 @@ def collision_key(name: str) -> str:
     )
 
 
+def is_text(path: object) -> bool:
+    """Return whether a path is valid Unicode, which some libraries need."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
 def quoted_name(name: str) -> str:
     """Return a name for use in a sentence: quoted, escaped and cut."""
     text = name if len(name) <= 80 else f"{name[:60]}...{name[-15:]}"

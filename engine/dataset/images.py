@@ -13,6 +13,7 @@ from PIL.TiffImagePlugin import ImageFileDirectory_v2
 from octasplat.engine.core.color import linear_to_srgb
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.image_messages import image_message
+from octasplat.engine.core.portable_names import is_text
 from octasplat.engine.core.threads import limit_torch_threads
 from octasplat.engine.dataset.image_info import ImageInfo, Storage
 
@@ -151,6 +152,8 @@ def open_image(path: Path) -> tuple[Any, Any]:
     Raises:
         DatasetError: the file is missing or not an image.
     """
+    if not is_text(path):
+        raise DatasetError(f"{path} cannot be read as an image: its path is no text; rename it.")
     # By default OpenImageIO multiplies alpha into the colors of formats that store them straight.
     wish = oiio.ImageSpec()
     wish.attribute("oiio:UnassociatedAlpha", 1)

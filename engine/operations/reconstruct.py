@@ -1,7 +1,7 @@
 """``reconstruct``: photographs to a scene, its meshes and measurements."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
@@ -251,8 +251,10 @@ def scene_folder(request: ReconstructRequest) -> Path:
     """Return the folder of the photographs; that of a video's frames is beside the output."""
     from octasplat.engine.dataset.video_frames import is_video
 
-    source = request.source
-    return request.output.with_name(f"{request.output.name}-frames") if is_video(source) else source
+    source, output = request.source, request.output
+    if output.name in ("", ".."):  # as of ".", which has no name of its own
+        output = output.resolve()
+    return output.with_name(f"{output.name}-frames") if is_video(source) else source
 
 
 def _take_frames(request: ReconstructRequest, folder: Path, progress: EventListener) -> None:
@@ -292,7 +294,6 @@ def run(
         OctasplatError: as :func:`octasplat.engine.pipeline.reconstruction` does.
     """
     from octasplat.engine.core.progress import stop_when_asked
-    from octasplat.engine.evaluate.summary import summarize_run
     from octasplat.engine.pipeline import reconstruct
     from octasplat.engine.poses.photographs import locate_scene
 
@@ -317,13 +318,20 @@ def run(
         blocks=blocks,
         start_from=request.start_from,
     )
+    return finished_result(output, config.exports)
+
+
+def finished_result(output: Path, exports: Sequence[str]) -> ReconstructResult:
+    """Return the result of the finished run in a folder, whose files of these names were asked for."""
+    from octasplat.engine.evaluate.summary import summarize_run
+
     return ReconstructResult(
-        files=tuple(output / name for name in (_SCENE, *config.exports, _METRICS, _REPORT)),
+        files=tuple(output / name for name in (_SCENE, *exports, _METRICS, _REPORT)),
         folder=output,
         metrics=json.loads((output / _METRICS).read_text(encoding="utf-8")),
         scene=output / _SCENE,
         report=output / _REPORT,
-        summary=tuple(summarize_run(output, config.exports)),
+        summary=tuple(summarize_run(output, exports)),
     )
 
 

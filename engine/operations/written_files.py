@@ -18,6 +18,7 @@ from pathlib import Path
 import platformdirs
 
 from octasplat.engine.core.errors import ConfigError, OutputError
+from octasplat.engine.core.portable_names import is_text
 from octasplat.engine.core.scene_layout import SCENE_FOLDERS
 from octasplat.engine.dataset.results_among import is_run_folder
 
@@ -34,7 +35,7 @@ _KINDS = {**dict.fromkeys(_SCENES, "scene"), "render": "pictures", "relight": "p
 """Verbs that write the same kind of output; that of each other verb is its own."""
 _FOR_EDITS = "stage-init"
 """The verb whose output is there to be written on by hand; it is not replaced even if nobody has yet."""
-_UNCHANGED_SINCE = dict[str, tuple[int, int]]
+_UNCHANGED_SINCE = dict[str | bytes, tuple[int, int]]
 _DATASET_FOLDERS = ("input", *SCENE_FOLDERS)
 _RUN_FILES = (
     "config.json", "events.jsonl", "held_out.json", "views.json", "training.json", "plan.json", "scene.ply",
@@ -56,13 +57,16 @@ def check_targets(
 
     Raises:
         ConfigError: one of them is read.
-        OutputError: one of them is there and somebody else's.
+        OutputError: one of them is there and somebody else's, or in the place of its folder is a file.
     """
     checked = tuple(dict.fromkeys(targets))  # each once, in order
     read = _Read([path for path in inputs if path is not None])
     for target in checked:
         if target.is_dir():
             raise OutputError(f"{target} is a folder; name a file.")
+        above = next((folder for folder in target.parents if folder.exists()), None)
+        if above is not None and not above.is_dir():
+            raise OutputError(f"{target} cannot be written, as {above} is a file; choose another -o.")
         if (folder := read.place_of(target)) is not None:
             raise ConfigError(f"{target}: would overwrite what the command reads{folder}; choose another -o.")
     there = [target for target in checked if target.exists()]
@@ -83,7 +87,7 @@ def remember_written(verb: str, files: Iterable[Path]) -> None:
     for file in files if verb != _FOR_EDITS else ():
         with suppress(OSError):  # a file that is gone is not remembered
             stat = file.stat()
-            rows.append((str(file.resolve()), _kind_of_verb(verb), stat.st_size, stat.st_mtime_ns))
+            rows.append((_database_key(file), _kind_of_verb(verb), stat.st_size, stat.st_mtime_ns))
     # The record is a convenience: where it cannot be kept, --overwrite is needed once more.
     with suppress(OSError, sqlite3.Error), _open_database() as database, database:
         database.executemany("INSERT OR REPLACE INTO written VALUES (?, ?, ?, ?)", rows)
@@ -137,10 +141,16 @@ def _kind_of_verb(verb: str) -> str:
     return _KINDS.get(verb, verb)
 
 
+def _database_key(file: Path) -> str | bytes:
+    """Return the place of a file as text, or as bytes where its name is no text, which SQLite refuses."""
+    place = str(file.resolve())
+    return place if is_text(place) else os.fsencode(place)
+
+
 def _is_ours(file: Path, known: _UNCHANGED_SINCE) -> bool:
     stat = file.stat()
     # size and time are enough: nobody changes a file and keeps both by accident
-    return known.get(str(file.resolve())) == (stat.st_size, stat.st_mtime_ns)
+    return known.get(_database_key(file)) == (stat.st_size, stat.st_mtime_ns)
 
 
 def _recorded_files(verb: str, files: Sequence[Path]) -> _UNCHANGED_SINCE:
@@ -149,8 +159,8 @@ def _recorded_files(verb: str, files: Sequence[Path]) -> _UNCHANGED_SINCE:
     with suppress(OSError, sqlite3.Error), _open_database() as database:
         for file in files:
             query = "SELECT size, time_ns FROM written WHERE path = ? AND kind = ?"
-            for size, time_ns in database.execute(query, (str(file.resolve()), _kind_of_verb(verb))):
-                found[str(file.resolve())] = (size, time_ns)
+            for size, time_ns in database.execute(query, (_database_key(file), _kind_of_verb(verb))):
+                found[_database_key(file)] = (size, time_ns)
     return found
 
 

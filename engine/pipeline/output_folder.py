@@ -12,6 +12,7 @@ from octasplat.engine.core.errors import (
     OutputError,
     SceneFileError,
 )
+from octasplat.engine.core.portable_names import is_text
 from octasplat.engine.core.relative_paths import normalize_name
 from octasplat.engine.core.versions import package_versions
 from octasplat.engine.core.writing import write_json
@@ -33,6 +34,8 @@ def claim_output(scene: Path, output: Path, config: ReconstructionConfig, resume
     """
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output} is a file; name a folder for the results.")
+    if not is_text(output.absolute()):  # else its pictures could not be written in the end
+        raise OutputError(f"{output}: the path is no text; name another folder for the results.")
     if (output / CONFIG).exists():
         if not resume:
             raise OutputError(

@@ -20,7 +20,12 @@ from octasplat.engine.dataset.photograph_files import image_folder
 
 
 def locate_scene(folder: Path) -> Path:
-    """Return the scene that ``folder`` is, or the one below it where there is nothing beside that."""
+    """Return the scene that ``folder`` is, or the one below it where there is nothing beside that.
+
+    Raises:
+        DatasetError: it is no folder.
+    """
+    _check_folder(folder)
     inner = folder / _layout_of(folder).folder
     return inner if image_folder(inner) != inner or has_model(inner) else folder
 
@@ -34,8 +39,7 @@ def photographs_of_scene(scene: Path) -> list[str]:
     Raises:
         DatasetError: it is no folder, or there are fewer than three; the text names what is left out.
     """
-    if not scene.is_dir():
-        raise DatasetError(f"{scene} is not a folder; name the folder that holds the photographs.")
+    _check_folder(scene)
     layout, folder = _layout_of(scene), image_folder(scene)
     images = {name: path for name, path in layout.files.items() if name.startswith(IMAGES)}
     masks = masks_beside(images)
@@ -52,6 +56,11 @@ def notes_on_files(scene: Path) -> tuple[str, ...]:
     layout = _layout_of(scene)
     unportable = unportable_names_sentence(layout.files)
     return layout.notes if unportable is None else (*layout.notes, unportable)
+
+
+def _check_folder(scene: Path) -> None:
+    if not scene.is_dir():
+        raise DatasetError(f"{scene} is not a folder; name the folder that holds the photographs.")
 
 
 def _layout_of(scene: Path) -> SceneLayout:

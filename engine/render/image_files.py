@@ -15,6 +15,7 @@ from jaxtyping import Float32
 from octasplat.engine.core.color import srgb_to_linear, to_bytes
 from octasplat.engine.core.errors import DatasetError, OutputError
 from octasplat.engine.core.image_messages import image_message
+from octasplat.engine.core.portable_names import is_text
 from octasplat.engine.core.writing import atomic_replace
 
 _RAW_CONFIG = "oiio:UnassociatedAlpha"
@@ -175,6 +176,8 @@ def shrink_to(image: Float32[np.ndarray, "h w c"], max_side_px: int) -> Float32[
 
 
 def _write(path: Path, spec: Any, pixels: np.ndarray) -> None:
+    if not is_text(path):
+        raise OutputError(f"Cannot write {path}: its path is no text; choose another.")
     # Not called by its type, an ImageSpec: the tests' type checker would keep that beyond OpenImageIO's end.
     spec.attribute(_RAW_CONFIG, 1)
     try:

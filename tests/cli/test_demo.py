@@ -1,5 +1,6 @@
 """``octasplat demo``, made tiny."""
 
+import json
 import signal
 import subprocess
 import sys
@@ -107,6 +108,13 @@ def test_demo_is_generated_once_and_names_report(octasplat, first_demo, tiny_dem
     assert second.exit_code == 0, second.output
     assert second.stdout.splitlines() == told.splitlines()[-1:]
     assert opened == [report.as_uri()]
+
+
+def test_finished_demo_is_json_again(octasplat, first_demo, tiny_demo):
+    folder, _ = first_demo
+    again = octasplat("demo", "-o", folder, *SIZE, "--json")
+    assert again.exit_code == 0, again.output
+    assert json.loads(again.stdout)["report"] == str(folder / "result" / "report.html")
 
 
 def test_demo_resumes_automatically(octasplat, first_demo, tiny_demo):

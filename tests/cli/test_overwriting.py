@@ -158,3 +158,21 @@ def test_python_has_the_same_guard(here, monkeypatch):
     osp.crop("scene.ply", "x.ply", where="opacity > 0", overwrite=True)
     osp.crop("scene.ply", "x.ply", where="opacity > 0")
     assert len(read_gaussian_ply(Path("x.ply"))[0]) > 0
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("render", "scene.ply", *ONE_IMAGE, "-o", "taken"),
+        ("render", "scene.ply", "--turntable", "--frames", "2", "-o", "taken/film.mp4"),
+        ("info", "scene.ply", "-o", "taken/facts.json"),
+        ("clean", "scene.ply", "-o", "taken/below/clean.ply"),
+    ],
+)
+def test_file_in_the_place_of_the_output_folder_is_named(octasplat, here, monkeypatch, arguments) -> None:
+    monkeypatch.chdir(here)
+    (here / "taken").write_bytes(NOT_OURS)
+    result = octasplat(*arguments)
+    assert result.exit_code == 1, result.output
+    assert "as taken is a file; choose another -o." in result.stderr
+    assert (here / "taken").read_bytes() == NOT_OURS

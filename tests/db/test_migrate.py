@@ -1,5 +1,6 @@
 """Tables are brought up to date once, from nothing and from what earlier versions left."""
 
+import json
 import os
 import subprocess
 import sys
@@ -105,9 +106,16 @@ def test_workers_and_read_commands_do_not_migrate(empty: str, tmp_path: Path) ->
 
     listed = octasplat("token", "list")
     assert listed.returncode == 1 and "octasplat migrate" in listed.stderr
+    quota = octasplat("quota", "somebody")
+    assert quota.returncode == 1 and "octasplat migrate" in quota.stderr
     assert shape(empty) == before
     assert "0001_jobs.sql" in octasplat("migrate").stdout
     assert octasplat("token", "list").returncode == 0
+    assert "jobs: 0 of any number" in octasplat("quota", "somebody").stdout
+    made = json.loads(octasplat("token", "create", "somebody", "--json").stdout)
+    assert octasplat("token", "revoke", made["id"]).stdout == "Revoked.\n"
+    again = octasplat("token", "revoke", made["id"])
+    assert again.returncode == 1 and "octasplat token list" in again.stderr
 
 
 def test_unreachable_database_is_one_sentence(tmp_path: Path) -> None:

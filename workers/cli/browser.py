@@ -34,8 +34,8 @@ def sign_in_link(api: "Api") -> str:
     return api.address + str(api.post("/v1/sign-in-links")["path"])
 
 
-def open_signed_in(api: "Api") -> None:
-    """Open the page of a service in a browser.
+def open_signed_in(api: "Api") -> bool:
+    """Open the page of a service in a browser; return False where no browser can be started.
 
     The link goes by way of a file that only this user reads: whoever is on the machine sees what programs
     are started with.
@@ -44,5 +44,7 @@ def open_signed_in(api: "Api") -> None:
     with tempfile.TemporaryDirectory(prefix="octasplat-open-") as folder:  # 0700
         path = Path(folder) / "open.html"
         path.write_text(_PAGE.format(link=link), encoding="ascii")
-        if webbrowser.open(path.as_uri()):
-            time.sleep(_PAGE_OPEN_SECONDS)  # the browser reads the file after it has started
+        if not webbrowser.open(path.as_uri()):
+            return False
+        time.sleep(_PAGE_OPEN_SECONDS)  # the browser reads the file after it has started
+        return True

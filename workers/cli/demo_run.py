@@ -7,7 +7,7 @@ from typing import Any
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.progress import counted_phase
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
-from octasplat.engine.operations.reconstruct import ReconstructRequest
+from octasplat.engine.operations.reconstruct import ReconstructRequest, finished_result
 from octasplat.engine.runs.config import ReconstructionConfig, read_config
 from octasplat.engine.runs.run_folder import CONFIG
 from octasplat.engine.settings.preset_names import PresetName
@@ -69,6 +69,8 @@ def reconstruct_demo_scene(
     report = output / "report.html"
     if not (resume and is_complete(output, config)):
         run_reconstruction(request, printer, threads=threads, resumes_automatically=True)
+    elif printer.as_json:
+        printer.print(finished_result(output, config.exports), ())
     return report
 
 

@@ -4,12 +4,14 @@ Everything heavy is imported by the commands when they run, so that ``--help`` a
 """
 
 import errno
+import io
 import os
 import sys
 import traceback
 import warnings
 from functools import cache
 from importlib import import_module
+from pathlib import Path
 from typing import Any, NoReturn, TextIO
 
 import click
@@ -213,7 +215,26 @@ def _show_warning(
         (file or sys.stderr).write(warnings.formatwarning(message, category, filename, lineno, line))
 
 
+def _open_missing_streams() -> None:
+    """Let standard streams that the caller has closed lead nowhere.
+
+    Else the next file that is opened takes the place of one, and native libraries print into it.
+    """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            # the lowest descriptor that is free, which is the closed one
+            setattr(sys, name, Path(os.devnull).open(mode, encoding="utf-8"))  # noqa: SIM115 (open until the end)
+
+
+def _show_any_text() -> None:
+    """Let standard output show what its encoding lacks, such as the name of a file, as escapes."""
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")
+
+
 def main() -> None:
     """Run the command line; warnings for users are one sentence."""
+    _open_missing_streams()
+    _show_any_text()
     warnings.showwarning = _show_warning
     cli(prog_name="octasplat")

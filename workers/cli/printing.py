@@ -1,14 +1,16 @@
 """What commands print: text for people, JSON for programs, or nothing but warnings."""
 
 import functools
+import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, TypeVar
 
 import click
-from pydantic_core import to_json
+from pydantic_core import PydanticSerializationError, to_json, to_jsonable_python
 
+from octasplat.engine.core.errors import OutputError
 from octasplat.engine.operations.base import Result
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -38,17 +40,34 @@ class Printer:
             value: a result, a model, or JSON values.
             lines: the same for people.
             quiet_lines: what is left of it with ``--quiet``.
+
+        Raises:
+            OutputError: standard output cannot be written.
         """
         if self.as_json:
-            click.echo(json_text(value.facts() if isinstance(value, Result) else value))
+            _echo(json_text(value.facts() if isinstance(value, Result) else value))
             return
         for line in quiet_lines if self.quiet else lines:
-            click.echo(line)
+            _echo(line)
 
     def note(self, text: str) -> None:
         """Print a sentence beside the value, unless the command is quiet or writes JSON."""
         if not self.hides_progress:
-            click.echo(text)
+            _echo(text)
+
+
+def _echo(text: str) -> None:
+    """Print a line on standard output.
+
+    Raises:
+        OutputError: standard output cannot be written, as where it is a file and the disk is full.
+    """
+    try:
+        click.echo(text)
+    except BrokenPipeError:  # whoever read the output has left
+        raise
+    except OSError as error:
+        raise OutputError(f"Standard output cannot be written ({error.strerror or error}).") from None
 
 
 def output_options(command: F) -> F:
@@ -65,8 +84,15 @@ def output_options(command: F) -> F:
 
 
 def json_text(value: Any) -> str:
-    """Return a value as JSON; numbers that are not finite become null, as JSON has none."""
-    return to_json(value, indent=2, inf_nan_mode="null", fallback=_plain_value).decode()
+    r"""Return a value as JSON; numbers that are not finite become null, as JSON has none.
+
+    Bytes of a file's name that are no text are written as escapes such as ``\udcff``, as Python has them.
+    """
+    try:
+        return to_json(value, indent=2, inf_nan_mode="null", fallback=_plain_value).decode()
+    except PydanticSerializationError:
+        plain = to_jsonable_python(value, inf_nan_mode="null", fallback=_plain_value)
+        return json.dumps(plain, indent=2)
 
 
 def _plain_value(value: Any) -> Any:

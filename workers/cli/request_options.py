@@ -111,6 +111,10 @@ def request_from_options(model: type[Any], given_values: dict[str, Any]) -> Any:
         # An option that may be repeated is () where it was not given.
         if value is not None and not (value == () and _may_repeat(model.model_fields[name]))
     }
+    for name, info in model.model_fields.items():
+        # click takes an option whose default is None for given, from 8.3 on
+        if info.is_required() and name not in values:
+            raise click.UsageError(f"Missing option '{option_name(model, name)}'.")
     check_inputs(model, values)  # some requests look into their source, with much to import
     try:
         return build_request(model, values, functools.partial(option_name, model))

@@ -1,11 +1,15 @@
 """``octasplat quota``: what an owner of tokens may take."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from octasplat.workers.cli.database import run_with_database
 from octasplat.workers.cli.printing import Printer, output_options
+
+if TYPE_CHECKING:
+    from octasplat.workers.db.connections import Connection
 
 
 class _SizeNumber(click.ParamType[int]):
@@ -56,12 +60,9 @@ def quota(
     All tokens of an owner share its limits. An owner with the share 2 gets twice the work done of one with 1,
     while both have jobs waiting.
     """
-    import asyncio
-
-    from octasplat.workers.settings import WorkerSettings, load_settings
-
-    settings = load_settings(WorkerSettings, data=data)
-    rows, its_share = asyncio.run(_set_and_read(settings.conninfo(), owner, clear, share, limits))
+    rows, its_share = run_with_database(
+        data, lambda connection: _set_and_read(connection, owner, clear, share, limits)
+    )
     shown = [
         f"{name}: {used} of {'any number' if limit is None else limit}"
         for name, (used, limit) in rows.items()
@@ -74,17 +75,15 @@ def quota(
 
 
 async def _set_and_read(
-    conninfo: str, owner: str, clear: bool, share: float | None, limits: dict[str, int | None]
+    connection: "Connection", owner: str, clear: bool, share: float | None, limits: dict[str, int | None]
 ) -> tuple[dict[str, tuple[int, int | None]], float]:
     """Return what is used of what may be, and the share of the workers."""
-    from octasplat.workers.db.connections import open_pool
     from octasplat.workers.db.quotas import NO_QUOTA, Quota, quota_of, set_quota, usage_of
 
-    async with open_pool(conninfo, max_size=1) as pool, pool.connection() as connection:
-        if clear or any(value is not None for value in (share, *limits.values())):
-            present = NO_QUOTA if clear else await quota_of(connection, owner)
-            await set_quota(connection, owner, Quota(**limits, share=share).with_defaults(present))
-        quota, usage = await quota_of(connection, owner), await usage_of(connection, owner)
+    if clear or any(value is not None for value in (share, *limits.values())):
+        present = NO_QUOTA if clear else await quota_of(connection, owner)
+        await set_quota(connection, owner, Quota(**limits, share=share).with_defaults(present))
+    quota, usage = await quota_of(connection, owner), await usage_of(connection, owner)
     rows = {
         "bytes": (usage.bytes, quota.max_bytes),
         "datasets": (usage.datasets, quota.max_datasets),

@@ -3,21 +3,20 @@
 import getpass
 import os
 import uuid
-from collections.abc import Awaitable, Callable
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import click
 
+from octasplat.engine.core.errors import ConfigError
+from octasplat.workers.cli.database import run_with_database
 from octasplat.workers.cli.printing import Printer, output_options, table_lines
 
 if TYPE_CHECKING:
     from octasplat.workers.db.connections import Connection
     from octasplat.workers.db.rows import Token
-
-T = TypeVar("T")
 
 SCOPES = ("read", "write", "admin", "metrics")
 
@@ -59,7 +58,7 @@ def create(
         await _add_audit_entry(connection, "token create", f"/v1/tokens/{made.id}")
         return made
 
-    made = _run_with_database(data, add)
+    made = run_with_database(data, add)
     printer.print({"id": made.id, "secret": secret}, [secret], quiet_lines=[secret])
 
 
@@ -71,7 +70,7 @@ def list_all(data: Path | None, printer: Printer) -> None:
     from octasplat.workers.db.tokens import list_tokens
 
     now = datetime.now(UTC)
-    found = _run_with_database(data, list_tokens)
+    found = run_with_database(data, list_tokens)
     rows = []
     for row in found:
         state = "revoked" if row.revoked_at else ",".join(row.scopes)
@@ -99,8 +98,9 @@ def revoke(token_id: uuid.UUID, data: Path | None, printer: Printer) -> None:
         await _add_audit_entry(connection, "token revoke", f"/v1/tokens/{token_id}")
         return await revoke_token(connection, token_id)
 
-    revoked = _run_with_database(data, shut)
-    printer.print({"revoked": revoked}, ["Revoked." if revoked else "There is no such token."])
+    if not run_with_database(data, shut):
+        raise ConfigError(f"There is no valid token {token_id}; octasplat token list shows them.")
+    printer.print({"revoked": True}, ["Revoked."])
 
 
 async def _add_audit_entry(connection: "Connection", action: str, target: str) -> None:
@@ -117,28 +117,3 @@ def _local_user_name() -> str:
         return getpass.getuser()
     except (OSError, KeyError):  # no name
         return str(os.getuid())
-
-
-def _run_with_database(data: Path | None, action: Callable[["Connection"], Awaitable[T]]) -> T:
-    """Run something on a connection."""
-    import asyncio
-
-    import psycopg
-
-    from octasplat.workers.db.connections import open_pool
-    from octasplat.workers.db.errors import DatabaseError
-    from octasplat.workers.settings import WorkerSettings, load_settings
-
-    conninfo = load_settings(WorkerSettings, data=data).conninfo()
-
-    async def run() -> T:
-        try:
-            async with open_pool(conninfo, max_size=1) as pool, pool.connection() as connection:
-                return await action(connection)
-        except (psycopg.errors.UndefinedTable, psycopg.errors.UndefinedColumn):
-            raise DatabaseError(
-                "The database lacks tables of this version; run octasplat migrate, or start octasplat "
-                "serve or the front end."
-            ) from None
-
-    return asyncio.run(run())

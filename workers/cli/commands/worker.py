@@ -17,11 +17,14 @@ def parse_queues(text: str) -> dict[str, int]:
     queues: dict[str, int] = {}
     for part in filter(None, (part.strip() for part in text.split(","))):
         match = _QUEUE.fullmatch(part)
-        if match is None or match[2] == "0":
+        count = int(match[2] or 1) if match is not None else 0
+        if match is None or count == 0:
             raise click.UsageError(
                 f"--queues {part}: write a name such as cpu, or cpu=2 for two jobs at once."
             )
-        queues[match[1]] = int(match[2] or 1)
+        if match[1] in queues:
+            raise click.UsageError(f"--queues {text}: {match[1]} is named twice; name it once.")
+        queues[match[1]] = count
     return queues
 
 
