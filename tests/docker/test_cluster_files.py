@@ -55,6 +55,14 @@ def test_pods_have_limits_and_time_to_hand_back_their_jobs() -> None:
     assert str(pod()["securityContext"]["runAsUser"]) in re.findall(r"USER (\d+)", text)
 
 
+def test_jobs_end_before_their_volume_evicts_the_pod() -> None:
+    """A worker sees the room of the node, not the limit of its volume."""
+    [config] = [found for found in documents() if found["kind"] == "ConfigMap"]
+    [size] = [volume["emptyDir"]["sizeLimit"] for volume in pod()["volumes"] if volume["name"] == "work"]
+    most = int(config["data"].get("OCTASPLAT_MAX_WORKSPACE_BYTES", 64 << 30))
+    assert most < int(size.removesuffix("Gi")) << 30
+
+
 def test_selectors_choose_the_pods() -> None:
     labels = {"app.kubernetes.io/name": "octasplat", "app.kubernetes.io/component": "worker"}
     for document in documents():
@@ -87,12 +95,13 @@ def test_slurm_script_hands_the_signal_to_the_worker(tmp_path: Path) -> None:
         time.sleep(0.05)
     process.send_signal(signal.SIGTERM)
     assert process.wait(60) == 0
-    work = tmp_path / "node" / "octasplat-71"
+    # No folder of this job alone: no other worker would sweep it.
+    work = tmp_path / "node" / f"octasplat-{os.getuid()}"
     assert output.read_text().splitlines() == [
         f"worker --queues cpu --name slurm-71 8 postgresql:///x y {work}",
         "handed back",
     ]
-    assert work.is_dir()
+    assert work.stat().st_mode & 0o777 == 0o700
 
 
 @pytest.mark.skipif(shutil.which("sbatch") is None, reason="there is no Slurm")

@@ -15,6 +15,9 @@ import compose_spec
 import pytest
 import yaml
 
+from octasplat.service.serving import SHUTDOWN_SECONDS
+from octasplat.workers.serve.local_service import EXTRA_GRACE_SECONDS
+from octasplat.workers.settings import WorkerSettings
 from tests.docker.test_docker_files import DOCKER, ROOT, compose
 from tests.support.http_server import QuietHandler, serve_http
 
@@ -109,6 +112,18 @@ def test_compose_file_is_accepted() -> None:
     command = ["docker", "compose", "-f", str(DOCKER / "compose.yaml"), "config", "--quiet"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_services_have_longer_to_end_than_they_give_themselves() -> None:
+    services = compose()["services"]
+    times = {name: services[name].get("stop_grace_period", "10s") for name in ("front-end", "database")}
+    assert int(times["front-end"].removesuffix("s")) > SHUTDOWN_SECONDS
+    assert int(times["database"].removesuffix("s")) >= 60
+    unit = (DEPLOY / "octasplat.service").read_text()
+    [stop] = re.findall(r"^TimeoutStopSec=(\d+)$", unit, re.MULTILINE)
+    # The database ends after its clients.
+    grace_seconds = WorkerSettings.model_fields["grace_seconds"].default
+    assert int(stop) > grace_seconds + EXTRA_GRACE_SECONDS + 30
 
 
 def test_systemd_accepts_the_unit(tmp_path: Path) -> None:
