@@ -20,6 +20,7 @@ import pytest
 
 from octasplat.service.json_bounds import find_excess, parse_in_pieces
 from octasplat.service.routes.scene_previews import MAX_BODY_BYTES
+from tests.support.daily import some_daily
 from tests.support.service_harness import ConnectService, new_job
 
 LARGEST_BYTES = 1 << 20
@@ -114,10 +115,7 @@ ALWAYS = {"many members", "escaped quotes that nothing closes", "one deep list",
 """One of each sort; the other shapes are exhaustive."""
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=[] if name in ALWAYS else [pytest.mark.exhaustive]) for name in SHAPES],
-)
+@pytest.mark.parametrize("name", some_daily(SHAPES, ALWAYS))
 async def test_no_body_of_json_holds_the_loop(connect_service: ConnectService, name: str) -> None:
     body = SHAPES[name]()[:LARGEST_BYTES]
     held = {}
