@@ -1,17 +1,9 @@
-// Steps through the pages in headless Chromium. The job comes on stdin as JSON: {name, url, chromium, playwright,
-// shots, seconds, ...}; what the steps found goes to stdout as JSON, with everything that a browser complains of.
+// Steps through the pages in headless Chromium, which `tests/support/browser.mjs` has started. The job is {name, url,
+// shots, seconds, ...}; the answer is what the steps found, with everything that a browser complains of.
 import { readFileSync, writeFileSync } from "node:fs";
-import { createRequire } from "node:module";
 import { join } from "node:path";
 
-const job = JSON.parse(readFileSync(0, "utf8"));
-const { chromium } = createRequire(join(job.playwright, "package.json"))("playwright-core");
-const complaints = [];
-
-const browser = await chromium.launch({
-    executablePath: job.chromium,
-    args: ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--force-color-profile=srgb"],
-});
+let job, browser, complaints;
 
 async function open({ width = 1200, height = 860, signedIn = true, ...options } = {}) {
     const context = await browser.newContext({ viewport: { width, height }, ...options });
@@ -854,12 +846,8 @@ const steps = {
     },
 };
 
-try {
-    const found = await steps[job.name]();
-    console.log(JSON.stringify({ ...found, complaints }));
-} catch (error) {
-    console.error(String(error.stack), complaints);
-    process.exitCode = 1;
-} finally {
-    await browser.close();
+/** Takes the steps that a job names. */
+export async function run(given, started) {
+    [job, browser, complaints] = [given, started, []];
+    return { ...await steps[job.name](), complaints };
 }
