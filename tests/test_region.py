@@ -101,6 +101,7 @@ def test_pixels_that_see_the_region_are_drawn_more_often() -> None:
     assert often / seldom == pytest.approx(FULL_FREQUENCY / OUTSIDE_FREQUENCY, rel=0.05)
 
 
+@pytest.mark.exhaustive
 def test_region_gets_the_detail_and_goes_on_after_a_stop(scene: Path, tmp_path: Path) -> None:
     told: list[Event] = []
     region = Region(BOX)

@@ -139,6 +139,7 @@ def test_file_of_gaussians_is_a_start(scene: Path, finished: Path, tmp_path: Pat
     np.testing.assert_allclose(gaussians(run).means_world, half.means_world, atol=1e-6)
 
 
+@pytest.mark.exhaustive
 def test_time_budget_counts_all_gaussians_of_the_start(scene: Path, finished: Path, tmp_path: Path) -> None:
     path, output = tmp_path / "many.ply", tmp_path / "run"
     first = gaussians(finished)

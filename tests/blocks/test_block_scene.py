@@ -148,6 +148,7 @@ def test_merged_scene_numbers_one_core_after_the_other(scene: Path, polished_blo
         assert stays[1] < 0.1 * (~is_inner).sum()  # the polish has moved these
 
 
+@pytest.mark.exhaustive
 def test_progress_counts_all_trainings(two_blocks: tuple) -> None:
     run, events = two_blocks
     told = [event for event in events if isinstance(event, TrainingProgress)]
@@ -228,12 +229,14 @@ def test_unsupported_settings_are_refused_before_anything_is_made(
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.exhaustive
 def test_other_blocks_than_the_run_s_own_are_refused(scene: Path, two_blocks: tuple) -> None:
     for blocks in (BlockRequest(count=3), BlockRequest(count=1), BlockRequest()):
         with pytest.raises(ConfigError, match="other blocks"):
             reconstruct(scene, two_blocks[0], make_config(), resume=True, blocks=blocks)
 
 
+@pytest.mark.exhaustive
 def test_no_seam_is_seen_around_the_cut(scene: Path, two_blocks: tuple, whole: Path) -> None:
     """What blocks lose against the whole is not more where the Gaussians beside the cut are seen."""
     run, config = two_blocks[0], make_config()

@@ -59,6 +59,7 @@ def test_demo_scene_only_writes_dataset_only(octasplat, tmp_path):
     assert str(tmp_path / "still") in result.stdout
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_demo_signal_leaves_no_partial_scene(start_octasplat, tmp_path, number, code):
     process = start_octasplat("demo", "-o", tmp_path / "still", "--dataset-only", "--views", 500)

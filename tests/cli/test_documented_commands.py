@@ -28,6 +28,9 @@ VERBS = {
 PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md")), DOCS / "opening" / "blender.md"]
 WITH_MATERIALS = {"docs/materials.md"}
 LONG = {*WITH_MATERIALS, "docs/results.md"}
+FIRST = {"README.md", "docs/first_scene.md"}
+"""Pages that a new user reads first, whose trainings run daily."""
+TRAINING = {"demo", "reconstruct", "surface"}
 PHOTOGRAPHS = (
     "SCENE", "SCENE/test", "PHOTOS", "PHOTOGRAPHS", "SITE", "fox", "shiny_knot", "shiny_knot/test",
     "still_life",
@@ -58,8 +61,9 @@ LIT_SURFACE = {"--texture-size": "128", "--max-triangles": "400"}
 
 
 def is_long(command: DocumentedCommand) -> bool:
-    """Return whether a command takes long, as what it trains has materials."""
-    return command.page in LONG or (command.words[0] == "reconstruct" and "--materials" in command.words)
+    """Return whether a command takes long."""
+    trains = command.words[0] in TRAINING and (command.page not in FIRST or "--materials" in command.words)
+    return command.page in LONG or trains
 
 
 def runnable() -> list[Any]:

@@ -100,6 +100,7 @@ def test_far_run_is_measured_as_at_the_origin(octasplat, runs, others):
     assert found[0][0] > 5
 
 
+@pytest.mark.exhaustive
 def test_other_photographs_at_the_origin_do_not_belong_to_a_far_run(octasplat, runs, run):
     result = octasplat("evaluate", runs[1], "--other-dataset", run.scene)
     assert result.exit_code == 1 and "world" in result.stderr

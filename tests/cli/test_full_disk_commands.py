@@ -53,9 +53,9 @@ LATER = ("metrics.json", "report.html", "viewer.glb", "octagons.ply", "octagons.
         (("cache",), "cache/rgb.bin", 30_000),
         (("checkpoints", "scene.ply", *LATER), "checkpoints/iteration_0000000.npz", 30_000),
         (("scene.ply", *LATER), "scene.ply", 20_000),
-        (("report.html",), "report.html", 40_000),
-        (("octagons.obj",), "octagons.obj", 40_000),
-        (("octagons.glb",), "octagons.glb", 40_000),
+        pytest.param(("report.html",), "report.html", 40_000, marks=pytest.mark.exhaustive),
+        pytest.param(("octagons.obj",), "octagons.obj", 40_000, marks=pytest.mark.exhaustive),
+        pytest.param(("octagons.glb",), "octagons.glb", 40_000, marks=pytest.mark.exhaustive),
     ],
 )
 def test_full_disk_error_names_file_and_run_resumes(copy, run, octasplat, missing, named, limit_bytes):
@@ -91,6 +91,7 @@ def test_full_disk_while_writing_depth_maps_is_reported(run, octasplat, tmp_path
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.exhaustive
 def test_command_on_full_disk_prints_one_error(copy, run):
     output = copy("checkpoints", "scene.ply", *LATER)
 

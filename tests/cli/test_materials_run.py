@@ -113,6 +113,7 @@ def test_near_field_run_is_rendered_as_evaluated_and_relit_with_a_warning(scene,
     assert "hold the light of the photographs" in " ".join(result.output.split())
 
 
+@pytest.mark.exhaustive
 def test_exr_of_materials_run_keeps_radiance_above_white(materials_run, octasplat, tmp_path):
     """A PNG of the same picture is clipped."""
     bright = tmp_path / "bright"
@@ -170,6 +171,7 @@ def test_render_says_where_materials_cannot_be_shown(materials_run, octasplat, t
     assert not (tmp_path / "none.png").exists()
 
 
+@pytest.mark.exhaustive
 def test_render_of_plain_run_refuses_materials(run, octasplat, tmp_path):
     result = octasplat("render", run.output, "--shading", "materials", "-o", tmp_path / "views")
     assert result.exit_code == 1 and "has learnt no materials" in " ".join(result.output.split())

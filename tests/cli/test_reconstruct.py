@@ -162,6 +162,7 @@ def test_signal_during_evaluation_stops_run(run, octasplat, monkeypatch):
     assert (run.output / "report.html").exists()
 
 
+@pytest.mark.exhaustive
 def test_terminal_output_has_progress_bar(scene, tiny, tmp_path):
     master, slave = pty.openpty()
     process = subprocess.Popen(

@@ -63,6 +63,7 @@ def test_poses_are_found_in_the_run_and_the_same_on_any_threads(photographs, oct
     assert octasplat("evaluate", runs[0]).exit_code == 0
 
 
+@pytest.mark.exhaustive
 def test_killed_run_leaves_no_colmap_files(photographs, start_octasplat, tmp_path, tiny):
     process = start_octasplat("reconstruct", photographs, "-o", tmp_path / "out", "--poses", "auto", *tiny)
     until = time.monotonic() + 60

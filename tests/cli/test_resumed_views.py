@@ -54,6 +54,7 @@ def test_changed_middle_photograph_starts_new_render(shiny_run, tmp_path, verb):
     assert goes_on(module, one)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("verb", some_daily(["render", "relight"], {"relight"}))
 def test_changed_middle_camera_starts_new_render(shiny_run, tmp_path, verb):
     def path(middle: float) -> dict[str, Any]:

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.daily import some_daily
+
 
 def octasplat_in_shell(redirection: str, *arguments: object) -> "subprocess.CompletedProcess[str]":
     """Run the command line with a redirection of the shell."""
@@ -17,7 +19,7 @@ def octasplat_in_shell(redirection: str, *arguments: object) -> "subprocess.Comp
     )
 
 
-@pytest.mark.parametrize("redirection", [">&-", ">&- <&-"])
+@pytest.mark.parametrize("redirection", some_daily([">&-", ">&- <&-"], [">&- <&-"]))
 def test_command_does_its_work_with_standard_output_closed(run, tmp_path: Path, redirection: str) -> None:
     done = octasplat_in_shell(redirection, "clean", run.output / "scene.ply", "-o", tmp_path / "clean.ply")
     assert (done.returncode, done.stderr) == (0, "")
@@ -25,7 +27,7 @@ def test_command_does_its_work_with_standard_output_closed(run, tmp_path: Path, 
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="this system has no such device")  # noqa: PTH110
-@pytest.mark.parametrize("options", [(), ("--json",)])
+@pytest.mark.parametrize("options", [(), pytest.param(("--json",), marks=pytest.mark.exhaustive)])
 def test_full_disk_behind_standard_output_is_told(run, options: tuple[str, ...]) -> None:
     done = octasplat_in_shell(">/dev/full", "info", run.output, *options)
     assert done.returncode == 1

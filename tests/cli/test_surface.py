@@ -41,6 +41,7 @@ def test_surface_all_options_write_textured_obj(run, octasplat, tmp_path):
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["a.mtl", "a.obj", "a.png"]
 
 
+@pytest.mark.exhaustive
 def test_surface_levels_of_detail_match_single_runs(run, octasplat, tmp_path):
     options = (*SMALL, "--texture-size", 64, "--threads", 1)
     result = octasplat(

@@ -51,6 +51,7 @@ def test_surface_of_run_has_textures_and_environment(shiny, octasplat, tmp_path)
     assert not (tmp_path / "b.glb").exists()
 
 
+@pytest.mark.exhaustive
 def test_surface_lit_up_axis_option_orients_glb(shiny, octasplat, tmp_path):
     for up, axis in (((), (0, -1, 0)), (("--up", "z"), (0, 0, 1))):
         result = octasplat(

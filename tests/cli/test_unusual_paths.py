@@ -52,6 +52,7 @@ def test_name_that_is_no_text_is_escaped_in_json(octasplat, undecodable: Path) -
     assert json.loads(result.stdout)["source"] == str(undecodable)
 
 
+@pytest.mark.exhaustive
 def test_name_that_output_cannot_show_is_escaped(undecodable: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "octasplat", "info", undecodable],

@@ -132,6 +132,7 @@ def test_dataset_cache_other_scene_with_same_metadata_invalidates(tmp_path, make
     assert round(float(data.view_image(0)[0][0, 0, 2]) * 255) == 90
 
 
+@pytest.mark.exhaustive
 @pytest.mark.heavy
 def test_photographs_do_not_fill_memory(tmp_path, make_scene):
     # 12 x 9 MP: a cache of 324 MB. Private memory is what cannot be given back under pressure.

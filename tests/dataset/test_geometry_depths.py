@@ -190,6 +190,7 @@ def test_photographs_with_a_map_of_their_own_keep_it(with_geometry: Path, tmp_pa
     np.testing.assert_allclose(known_distances(fitted, 1), known_distances(mixed, 1))
 
 
+@pytest.mark.exhaustive
 def test_geometry_elsewhere_is_refused(with_geometry: Path, tmp_path: Path) -> None:
     mesh = read_mesh(with_geometry / "geometry.ply")
     for number, moved in enumerate((mesh.vertices * 1.5, mesh.vertices + np.array([1000.0, 0, 0]))):

@@ -94,6 +94,7 @@ def test_newer_compatible_database_is_accepted(empty: str) -> None:
     assert shape(empty) == before and reach[0] in {step.name for step in all_migrations()}
 
 
+@pytest.mark.exhaustive
 def test_workers_and_read_commands_do_not_migrate(empty: str, tmp_path: Path) -> None:
     before = shape(empty)
     with pytest.raises(DatabaseError, match="octasplat migrate"):

@@ -188,6 +188,7 @@ def test_far_and_near_scenes_are_merged_with_a_warning(
     np.testing.assert_allclose(positions[:120], positions[120:], atol=1e-6)
 
 
+@pytest.mark.exhaustive
 def test_surface_of_a_far_scene_is_that_at_the_origin(
     octasplat: Run, make_scene: Callable[..., FlatGaussians], tmp_path: Path
 ) -> None:

@@ -48,6 +48,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.mark.exhaustive
 def test_maps_hold_the_materials_normals_and_depths_of_the_parts(folder: Path) -> None:
     truth = read_ground_truth(folder / "truth.json")
     model = load_dataset_model(folder / "test", min_views=1, for_training=False)
@@ -141,6 +142,7 @@ def read_table(text: str) -> dict[str, list[float]]:
     }
 
 
+@pytest.mark.exhaustive
 def test_things_and_skies_are_whole() -> None:
     assert set(CHOOSING) | set(REPORTING) == set(THINGS) and len(CHOOSING) == 2
     assert set((CHOOSING | REPORTING).values()) == set(SKIES)

@@ -77,6 +77,7 @@ def test_writing_takes_no_more_memory_for_more_gaussians(name: str, tmp_path: Pa
     assert growth(peaks) <= WRITTEN[name] + NOISE_BYTES
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("name", some_daily(READ, {"a.mesh.ply", "a.spz"}))
 def test_reading_takes_no_more_memory_than_the_scene(name: str, tmp_path: Path) -> None:
     beyond = []
@@ -88,6 +89,7 @@ def test_reading_takes_no_more_memory_than_the_scene(name: str, tmp_path: Path) 
     assert growth(beyond) <= READ[name] + NOISE_BYTES
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("name", some_daily(["a.spz", "a.compressed.ply", "a.sog"], {"a.spz"}))
 def test_losses_are_told_in_little_memory(name: str, tmp_path: Path) -> None:
     scenes = [random_scene(count) for count in COUNTS]
@@ -95,6 +97,7 @@ def test_losses_are_told_in_little_memory(name: str, tmp_path: Path) -> None:
     assert growth(peaks) <= ORDER_BYTES
 
 
+@pytest.mark.exhaustive
 def test_version_4_of_spz_takes_what_it_compresses_to(tmp_path: Path) -> None:
     options = ExportOptions(spz_version=4)
     scenes = [random_scene(count) for count in COUNTS]

@@ -162,6 +162,7 @@ def test_comments_that_declare_more_columns_than_a_file_has_are_passed_over(tmp_
     assert len(cloud.means_world) == 1 and not cloud.channels.widths
 
 
+@pytest.mark.exhaustive
 def test_obj_with_many_material_changes_is_read_in_linear_time(tmp_path: Path) -> None:
     path = tmp_path / "a.obj"
     path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "usemtl a\n" * 400_000 + "f 1 2 3\n")

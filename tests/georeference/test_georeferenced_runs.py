@@ -40,6 +40,7 @@ def run(scene, tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.exhaustive
 def test_run_states_where_it_lies(run):
     found = read_georeference(run / "georeference.json")
     assert found is not None and found.crs == "EPSG:4979" and found.method == "GPS"

@@ -18,6 +18,7 @@ from octasplat.service.intake.model_check import ModelLimits, check_model, parse
 from octasplat.service.intake.upload_names import check_file_name
 from octasplat.workers.storage.local import LocalStorage
 from octasplat.workers.storage.trees import TreeFile
+from tests.support.daily import some_daily
 from tests.support.model_builder import (
     CameraRecord,
     ColmapModelBuilder,
@@ -156,7 +157,11 @@ HORRORS: dict[str, tuple[Callable[[], ColmapModelBuilder], str, str | None]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", HORRORS)
+ALWAYS = {"unknown camera", "2^63 images", "one point too few", "two views"}
+"""One of each sort; the other models are exhaustive."""
+
+
+@pytest.mark.parametrize("case", some_daily(HORRORS, ALWAYS))
 def test_dataset_inconsistent_model_is_refused(local_storage: LocalStorage, case: str) -> None:
     make, code, file = HORRORS[case]
     began = time.perf_counter()
@@ -274,6 +279,7 @@ def test_model_child_respects_resource_limits(local_storage: LocalStorage) -> No
     assert fault.code in ("model-memory", "model-crash")
 
 
+@pytest.mark.exhaustive
 def test_model_child_timeout_is_reported(local_storage: LocalStorage) -> None:
     line = b"1 1 0 0 0 0 0 4 1 v0.png\n\n"
     slow = {

@@ -219,6 +219,7 @@ def samples() -> list[bytes]:
     return [make() for _, make in GOOD.values()] + [data for data in damaged if len(data) < 500]
 
 
+@pytest.mark.exhaustive
 @settings(max_examples=500, deadline=None)
 @given(
     st.deferred(lambda: st.sampled_from(samples())),

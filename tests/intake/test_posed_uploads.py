@@ -8,6 +8,7 @@ import pytest
 from octasplat.service.intake.dataset import check_dataset
 from octasplat.service.intake.faults import IntakeError
 from octasplat.workers.storage.local import LocalStorage
+from tests.support.daily import some_daily
 from tests.support.model_builder import ColmapModelBuilder, photographs, store_model
 
 
@@ -44,7 +45,11 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize("kind", SCENES)
+ALWAYS = {"nerfstudio", "Blender", "at the top", "backslashes"}
+"""One of each sort; the other scenes are exhaustive."""
+
+
+@pytest.mark.parametrize("kind", some_daily(SCENES, ALWAYS))
 def test_poses_are_taken(local_storage: LocalStorage, kind: str) -> None:
     summary = check_dataset(local_storage, store_model(local_storage, {**photographs(NAMES), **SCENES[kind]}))
     assert (summary.views, summary.has_model, summary.camera_models) == (4, True, ("PINHOLE",))

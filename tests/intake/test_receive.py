@@ -220,6 +220,7 @@ print(blob.size_bytes, after - before)
 """
 
 
+@pytest.mark.exhaustive
 def test_memory_does_not_grow_with_the_upload(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", MEMORY, str(tmp_path), "300"],

@@ -203,6 +203,7 @@ def test_sphere_under_environment_matches_mitsuba(name: str, tmp_path: Path) -> 
     print(name, same(turned, tmp_path, [GROUND, bsdf], {"sky": sky}))  # noqa: T201
 
 
+@pytest.mark.exhaustive
 def test_ball_of_glass_filled_with_water_matches_mitsuba(tmp_path: Path) -> None:
     environment(tmp_path)
     sky = {"type": "envmap", "filename": str(tmp_path / "sky.exr")}
@@ -264,6 +265,7 @@ def test_point_and_directional_lights(tmp_path: Path) -> None:
     print("points", same(stage, tmp_path, [GROUND, red], emitters))  # noqa: T201
 
 
+@pytest.mark.exhaustive
 def test_emissive_and_light_spheres_match_mitsuba(tmp_path: Path) -> None:
     glow = Diffuse(color_srgb=(0, 0, 0), emission=4.0)
     shining = StageMesh(

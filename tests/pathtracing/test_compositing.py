@@ -76,6 +76,7 @@ def test_layers_have_standard_channel_names(tmp_path: Path) -> None:
     assert refused.exit_code == 1 and "holds no layers" in refused.output
 
 
+@pytest.mark.exhaustive
 def test_denoiser_keeps_noise_free_pixels() -> None:
     pytest.importorskip("pyoidn")
     floor = StageMesh(shape="plane", scale=2, material=Diffuse())

@@ -37,7 +37,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("by", ["split-sum", "path"])
+@pytest.mark.parametrize("by", some_daily(["split-sum", "path"], ["path"]))
 def test_white_furnace_of_white_metal(scene, tmp_path, by):
     done = relight(
         scene / "ball.ply",
@@ -58,6 +58,7 @@ def test_white_furnace_of_white_metal(scene, tmp_path, by):
     assert image["R"][inside].mean() == pytest.approx(0.5, rel=0.03)
 
 
+@pytest.mark.exhaustive
 def test_several_environments_have_folders_and_a_film(scene, tmp_path):
     maps = ("--environment", scene / "sides.exr", "--environment", scene / "white.hdr")
     done = relight(scene / "ball.ply", *maps, "-o", tmp_path / "out", *SMALL, "--background", "environment")

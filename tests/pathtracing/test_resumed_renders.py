@@ -80,6 +80,7 @@ def stopped_by(
     return subprocess.CompletedProcess(command, process.returncode, out, err)
 
 
+@pytest.mark.exhaustive
 def test_killed_render_resumes_frames(folder: Path) -> None:
     frames = folder / "turn.mp4.frames"
     killed = stopped_by(signal.SIGKILL, folder, "turn.mp4", frames / "unfinished.jsonl")
@@ -104,6 +105,7 @@ def stopped(folder: Path) -> subprocess.CompletedProcess[str]:
     return stopped_by(signal.SIGINT, folder, "views", folder / "views" / "unfinished.jsonl")
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("changed", some_daily(["stage.toml", "thing.obj", "scene.ply"], {"scene.ply"}))
 def test_images_of_another_stage_are_not_mixed_in(
     folder: Path, stopped: subprocess.CompletedProcess[str], tmp_path: Path, changed: str

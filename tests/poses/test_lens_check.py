@@ -99,6 +99,7 @@ def test_shifted_principal_points_are_found(moved: Path, tmp_path: Path) -> None
     assert json.loads((again / "poses.json").read_text()) == {"moved": ["a.png"]}
 
 
+@pytest.mark.exhaustive
 def test_lens_fit_keeps_unshifted_principal_point(still: Path, tmp_path: Path) -> None:
     assert adjust_principal_points(still / "sparse" / "0", tmp_path / "none") is None
     assert not any(tmp_path.iterdir())

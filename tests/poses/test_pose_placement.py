@@ -84,6 +84,7 @@ def test_placing_replaces_wrong_pose() -> None:
     assert again is not None and all(np.array_equal(a, b) for a, b in zip(found, again, strict=True))
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("given", "partners", "count"),
     [(TRUE, 12, 40), (WRONG, 2, 100), (WRONG, 12, 4)],

@@ -71,6 +71,7 @@ def test_pages_made_from_the_code_are_up_to_date(name: str, pages_from_the_code:
     assert written == pages_from_the_code[name], "python -m benchmarks.reference --write"
 
 
+@pytest.mark.exhaustive
 def test_site_builds_without_warnings(tmp_path: Path) -> None:
     command = (sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", tmp_path / "site")
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)

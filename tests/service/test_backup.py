@@ -116,6 +116,7 @@ async def test_restored_service_continues_jobs(
         await asyncio.to_thread(finish_jobs, WorkerHarness(elsewhere, there), made["jobs"][1:])
 
 
+@pytest.mark.exhaustive
 async def test_upload_goes_on_where_it_is_restored(
     conninfo: str, postgres: EmbeddedPostgres, template: str, tmp_path: Path
 ) -> None:

@@ -124,6 +124,7 @@ def narrow(start_front_end: StartFrontEnd) -> Iterator[FrontEnd]:
         yield front_end
 
 
+@pytest.mark.exhaustive
 def test_half_open_connections_keep_nobody_out(plain: FrontEnd) -> None:
     with contextlib.ExitStack() as opened:
         for number in range(2 * OPEN_FILES):

@@ -49,6 +49,7 @@ def elsewhere() -> Iterator[str]:
     thread.join()
 
 
+@pytest.mark.exhaustive
 def test_scene_at_an_address_is_fetched_checked_and_queued(
     conninfo: str, tmp_path: Path, elsewhere: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -69,6 +69,7 @@ def test_folder_of_a_bucket_is_fetched_checked_and_queued(front: FrontEnd, place
     assert again.content["dataset_id"] == dataset["id"] and tasks(conninfo) == len(SCENE)
 
 
+@pytest.mark.exhaustive
 def test_fetching_from_a_bucket_goes_on_where_it_was(front: FrontEnd, place: str, conninfo: str) -> None:
     bucket = Bucket(place)
     with Api(front.address, front.token) as api:
@@ -114,6 +115,7 @@ def test_archive_of_a_bucket_is_fetched_and_what_is_not_there_is_told(
         assert told.exit_code != 0 and words in told.stderr, told.output
 
 
+@pytest.mark.exhaustive
 def test_folder_with_odd_characters_in_its_name_is_that_folder(front: FrontEnd, place: str) -> None:
     """And not the one whose name is what comes before the first of them."""
     odd = "fox#2 %23+é"

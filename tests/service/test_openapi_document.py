@@ -1,7 +1,9 @@
 """Clients are generated from the OpenAPI document: operation ids, descriptions, headers, what lists carry."""
 
+import functools
 import json
 import re
+from typing import Any
 
 import pytest
 
@@ -9,8 +11,14 @@ from octasplat.service.app import create_app
 from tests.support.service_harness import ConnectService, committed_dataset
 
 
+@functools.cache
+def document() -> dict[str, Any]:
+    """The document of a front end."""
+    return create_app().openapi()
+
+
 def test_operation_ids_are_unique_and_in_camel_case() -> None:
-    paths = create_app().openapi()["paths"]
+    paths = document()["paths"]
     found = [operation["operationId"] for path in paths.values() for operation in path.values()]
     assert len(found) == len(set(found))
     assert {"createJob", "cancelJob", "createDataset", "commitDataset", "createToken"} <= set(found)
@@ -18,11 +26,10 @@ def test_operation_ids_are_unique_and_in_camel_case() -> None:
 
 
 def test_every_parameter_is_described_and_a_server_is_named() -> None:
-    document = create_app().openapi()
-    assert [server["url"] for server in document["servers"]] == ["/"]
+    assert [server["url"] for server in document()["servers"]] == ["/"]
     nameless = [
         (path, parameter["name"])
-        for path, item in document["paths"].items()
+        for path, item in document()["paths"].items()
         for operation in item.values()
         for parameter in operation.get("parameters", ())
         if not parameter.get("description")
@@ -48,7 +55,7 @@ def test_every_parameter_is_described_and_a_server_is_named() -> None:
     ],
 )
 def test_headers_of_answers_are_declared(operation_id: str, status: str, names: set[str]) -> None:
-    operations = [o for item in create_app().openapi()["paths"].values() for o in item.values()]
+    operations = [o for item in document()["paths"].values() for o in item.values()]
     [operation] = [o for o in operations if o["operationId"] == operation_id]
     assert names <= set(operation["responses"][status]["headers"])
 

@@ -24,6 +24,7 @@ from octasplat.workers.client.download import download_results
 from octasplat.workers.client.submission import Submission, submit
 from octasplat.workers.client.upload import upload_scene
 from octasplat.workers.client.watch import watch_job
+from octasplat.workers.serve.local_service import lock_data_folder
 from tests.support.tiny_dataset import make_tiny_dataset
 
 pytestmark = pytest.mark.heavy
@@ -205,6 +206,7 @@ def test_reconstruction_after_kills_gives_same_bytes(
     assert (tmp_path / "views" / "view_000.png").exists()
 
 
+@pytest.mark.exhaustive
 def test_restarted_service_continues_and_derived_jobs_use_result(
     machine: Machine, scene: Path, undisturbed: Path, tmp_path: Path
 ) -> None:
@@ -260,8 +262,9 @@ def test_killed_database_is_restarted(machine: Machine, scene: Path) -> None:
         assert done["state"] == "succeeded", done
 
 
-def test_serve_on_locked_data_folder_is_refused(machine: Machine) -> None:
-    command = [sys.executable, "-m", "octasplat", "serve", "--data", str(machine.data), "--port", "0"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+def test_serve_on_locked_data_folder_is_refused(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "octasplat", "serve", "--data", str(tmp_path), "--port", "0"]
+    with lock_data_folder(tmp_path):
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 1 and "Another octasplat serve" in done.stderr
     assert "Traceback" not in done.stderr

@@ -11,6 +11,7 @@ import pytest
 from octasplat.engine.operations.render import parse_stage_text
 from octasplat.engine.pathtracing.stage.model import Stage
 from octasplat.engine.pathtracing.stage.text_bounds import check_stage_text
+from tests.support.daily import some_daily
 from tests.support.documentation import ROOT
 from tests.support.service_harness import ConnectService, new_job
 
@@ -34,6 +35,10 @@ ATTACKS: dict[str, dict[str, Any]] = {
 }
 
 
+ALWAYS = {"50,000 unknown keys", "1 MB of unknown settings of the training"}
+"""The slowest ones; the others are exhaustive."""
+
+
 async def answer_beside_healthz(
     http: httpx.AsyncClient, path: str, body: dict[str, Any]
 ) -> tuple[httpx.Response, float, float]:
@@ -50,7 +55,7 @@ async def answer_beside_healthz(
 
 
 @pytest.mark.parametrize("kind", ["render", "reconstruct"])
-@pytest.mark.parametrize("name", list(ATTACKS))
+@pytest.mark.parametrize("name", some_daily(ATTACKS, ALWAYS))
 async def test_costly_options_are_refused_while_others_are_answered(
     connect_service: ConnectService, name: str, kind: str
 ) -> None:

@@ -155,6 +155,7 @@ async def test_file_that_is_evicted_while_it_is_looked_at_is_sent(
         assert (await http.get(f"{second}/files/{NAME}")).content == PICTURE
 
 
+@pytest.mark.exhaustive
 async def test_eviction_at_the_same_time_leaves_no_file_without_content(
     connect_service: ConnectService, no_grace: None
 ) -> None:
@@ -320,6 +321,7 @@ def test_changed_folder_sends_only_what_changed(
         assert notes == ["b.obj (8 bytes) was not sent, as the service has it already."]
 
 
+@pytest.mark.exhaustive
 def test_file_that_changes_after_it_was_read_is_refused(
     conninfo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -355,6 +357,7 @@ with Api(sys.argv[1], sys.argv[2]) as api:
 """
 
 
+@pytest.mark.exhaustive
 def test_folder_goes_on_after_its_client_is_killed(conninfo: str, tmp_path: Path) -> None:
     scene = tmp_path / "scene"
     total = noise_scene(scene, 24, 60)

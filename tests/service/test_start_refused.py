@@ -31,6 +31,7 @@ def test_start_with_database_down_is_refused(tmp_path: Path) -> None:
     assert "hush" not in line
 
 
+@pytest.mark.exhaustive
 def test_serve_without_database_is_refused(tmp_path: Path) -> None:
     done = start(OCTASPLAT_DATA=str(tmp_path))
     assert done.returncode == 1 and "Traceback" not in done.stderr
@@ -39,7 +40,10 @@ def test_serve_without_database_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("settings", "word"),
-    [({}, "octasplat token create"), ({"STORAGE": "/dev/null/store"}, "/dev/null/store")],
+    [
+        pytest.param({}, "octasplat token create", marks=pytest.mark.exhaustive),
+        ({"STORAGE": "/dev/null/store"}, "/dev/null/store"),
+    ],
 )
 def test_start_with_invalid_settings_is_refused(
     conninfo: str, tmp_path: Path, settings: dict[str, str], word: str

@@ -18,6 +18,7 @@ ROOT = Path(__file__).parents[2]
 PATIENCE_SECONDS = 60.0
 
 
+@pytest.mark.exhaustive
 async def test_vanished_front_end_lease_expires(
     conninfo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -372,6 +372,7 @@ def test_memory_does_not_grow_with_the_upload(
     assert grown < 16 << 10
 
 
+@pytest.mark.exhaustive
 def test_upload_to_killed_service_keeps_complete_files_only(
     start_server: Callable[[], tuple[int, Path]], tmp_path: Path
 ) -> None:

@@ -169,6 +169,7 @@ def train(folder: Path, *, stop_after: int | None = None) -> tuple[Lamp, TrainSt
     return model, state, [event.psnr for event in events if isinstance(event, HeldOutMeasured)]
 
 
+@pytest.mark.exhaustive
 def test_custom_shading_model_trains_and_resumes(tmp_path: Path) -> None:
     whole, state, psnr = train(tmp_path / "whole")
     assert psnr[-1] > psnr[0] + 4

@@ -68,6 +68,7 @@ def test_expected_depth_is_there_to_choose(tracer, surface, tmp_path):
     )
 
 
+@pytest.mark.exhaustive
 def test_texture_has_the_colors_where_its_coordinates_say(textured):
     mesh = textured
     assert mesh.texture_srgb.shape == (256, 256, 3)

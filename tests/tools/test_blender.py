@@ -76,6 +76,7 @@ def test_blender_camera_exports_as_path(blend: Path, tmp_path: Path) -> None:
             assert getattr(other, name) == pytest.approx(getattr(one, name), rel=1e-5), name
 
 
+@pytest.mark.exhaustive
 def test_blender_script_renders_alone(scene: FlatGaussians, tmp_path: Path) -> None:
     export_scene(scene, tmp_path / "mesh.ply")
     image = tmp_path / "view.png"
@@ -87,6 +88,7 @@ def test_blender_script_renders_alone(scene: FlatGaussians, tmp_path: Path) -> N
     np.testing.assert_allclose(middle, 0.5, atol=0.1)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [

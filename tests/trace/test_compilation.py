@@ -88,6 +88,7 @@ def test_changed_inlined_source_is_recompiled(tmp_path: Path, imports: str, call
     assert found == ["6.0", "10.0"]
 
 
+@pytest.mark.exhaustive
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="needs users")
 def test_unwritable_cache_folder_is_replaced(tmp_path: Path) -> None:
     occupied = tmp_path / "file"
@@ -100,6 +101,7 @@ def test_unwritable_cache_folder_is_replaced(tmp_path: Path) -> None:
     assert list(private.rglob("*.nbi"))
 
 
+@pytest.mark.exhaustive
 def test_code_in_unwritable_cache_folder_is_read_where_it_is(tmp_path: Path) -> None:
     """As by the processes of jobs, which would copy many megabytes each."""
     shared, private = tmp_path / "shared", tmp_path / f"octasplat-kernels-{os.getuid()}"
@@ -115,6 +117,7 @@ def test_code_in_unwritable_cache_folder_is_read_where_it_is(tmp_path: Path) -> 
     assert not [path for path in private.rglob("*") if path.suffix in (".nbi", ".nbc")]
 
 
+@pytest.mark.exhaustive
 def test_world_writable_cache_folder_is_not_used(tmp_path: Path) -> None:
     shared = tmp_path / "shared"
     shared.mkdir()

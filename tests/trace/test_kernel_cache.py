@@ -94,6 +94,7 @@ def test_processes_that_need_a_kernel_at_once_compile_it_once(package: Path, tmp
     assert said == ["-1", "1"]
 
 
+@pytest.mark.exhaustive
 @pytest.mark.skipif(not landlock_version(), reason="the kernel has no Landlock")
 def test_confined_process_reads_code_that_it_cannot_write(package: Path, tmp_path: Path) -> None:
     code, mine = tmp_path / "code", tmp_path / "mine"

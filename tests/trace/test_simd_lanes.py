@@ -14,6 +14,7 @@ from octasplat.engine.trace.cpu.kernels import simd8, simd8_backward, simd16, si
 from octasplat.engine.trace.cpu.kernels.ray_mask import ellipse_bins
 from octasplat.engine.trace.cpu.kernels.simd_ops import DOUBLE8, INT8, MASK8, CompressedStore, load
 from octasplat.engine.trace.cpu.kernels.simd_vector import boxes_in_frustum, ellipses_in_frustum
+from tests.support.daily import some_daily
 
 ADDRESS, DOUBLE, SINGLE, WORD = types.uintp, types.float64, types.float32, types.int64
 
@@ -78,7 +79,11 @@ WITHOUT_PRODUCTS = (
 )
 
 
-@pytest.mark.parametrize("name", KERNELS)
+ALWAYS = {"backward_group16", "composite8", "boxes_in_frustum", "ellipse_bins"}
+"""The largest ones; the others are exhaustive."""
+
+
+@pytest.mark.parametrize("name", some_daily(KERNELS, ALWAYS))
 def test_lanes_become_registers_on_each_cpu(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     kernel, kinds = KERNELS[name]
     arguments = ", ".join(f"a{k}" for k in range(len(kinds)))

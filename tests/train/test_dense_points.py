@@ -140,6 +140,7 @@ def test_dense_points_count_zero_is_empty(dataset: Dataset) -> None:
     assert len(nothing) == 0 and nothing.xyz_world.shape == nothing.rgb_srgb.shape == (0, 3)
 
 
+@pytest.mark.exhaustive
 def test_dense_points_independent_of_threads(dataset: Dataset) -> None:
     one, three = (plane_sweep_points(dataset, 800, np.random.default_rng(3), threads=n) for n in (1, 3))
     assert len(one) > 300 and one.swept.any()

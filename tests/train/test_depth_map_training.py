@@ -114,6 +114,7 @@ def test_depth_weight_is_decided_by_the_maps() -> None:
     assert uses_shared_sort(with_depth_weight(off, has_depth_maps=True)) == uses_shared_sort(config)
 
 
+@pytest.mark.exhaustive
 def test_maps_make_the_geometry_right(plain_scene: Path, measured_scene: Path, tmp_path: Path) -> None:
     plain = reconstruct(plain_scene, tmp_path / "plain", make_config())
     measured = reconstruct(measured_scene, tmp_path / "measured", make_config())

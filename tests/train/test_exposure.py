@@ -271,6 +271,7 @@ class AutomaticWorld(UnevenWorld):
         return rgb * (1 + 0.4 * np.clip(points[:, :1], -1.4, 1.4)).astype(np.float32), alpha, weight
 
 
+@pytest.mark.exhaustive
 def test_test_photographs_with_auto_exposure_are_matched(tmp_path: Path) -> None:
     world = AutomaticWorld()
     assert world.log_gains.std() > 0.08

@@ -172,6 +172,7 @@ def test_background_initialises_from_photographs() -> None:
     np.testing.assert_allclose(again, first.map.lookup(above), atol=0.02)
 
 
+@pytest.mark.exhaustive
 def test_background_training_is_deterministic(tmp_path: Path) -> None:
     whole, _ = train(tmp_path / "whole", threads=1)
     two, _ = train(tmp_path / "two", threads=2)

@@ -39,6 +39,7 @@ def test_materials_of_matt_things_lose_accuracy(
     assert material_gain_db(dataset, background="black", seed=0, threads=2) < -1.0
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("gain_db", "share", "told"),
     [

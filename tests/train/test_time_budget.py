@@ -31,6 +31,7 @@ def test_time_budget_zero_still_trains() -> None:
     assert (plan.iterations, plan.max_gaussians) == (100, 2_000)
 
 
+@pytest.mark.exhaustive
 def test_time_budget_plan_is_saved_and_reused(tmp_path: Path) -> None:
     scene, output = tmp_path / "scene", tmp_path / "run"
     write_synthetic_dataset(

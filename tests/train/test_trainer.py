@@ -90,7 +90,7 @@ def test_trainer_seed_changes_result(whole_run: tuple[FlatGaussians, list[Event]
 @pytest.mark.parametrize(
     "strategy",
     [
-        McmcConfig(start=20, interval=20, growth=0.1),
+        pytest.param(McmcConfig(start=20, interval=20, growth=0.1), marks=pytest.mark.exhaustive),
         McmcConfig(start=20, interval=20, growth=0.1, error_power=1.0),
         RedisplatsConfig(start=20, interval=20, stop_fraction=0.9, step_threshold=1e-5),
     ],

@@ -25,6 +25,7 @@ async def _job_with_log(database: str) -> str:
     return str(job_id)
 
 
+@pytest.mark.exhaustive
 def test_log_goes_on_after_a_refused_request_and_after_folding(
     service: RunningService, browse: Browse, database: str
 ) -> None:

@@ -101,6 +101,7 @@ def test_training_is_watched_in_3d(
     assert found["corner"]
 
 
+@pytest.mark.exhaustive
 def test_result_is_measured_annotated_and_cropped(
     service: RunningService, browse: Browse, folder: Path, axe: str
 ) -> None:
@@ -159,6 +160,7 @@ def test_pages_around_jobs_are_accessible_and_presets_say_what_they_take(
     assert found["chosen"] == f"This takes {shown[:1].lower()}{shown[1:]}, within a factor of two."
 
 
+@pytest.mark.exhaustive
 def test_several_archives_become_a_job_each(
     service: RunningService, browse: Browse, folder: Path, tmp_path: Path
 ) -> None:
@@ -175,6 +177,7 @@ def test_several_archives_become_a_job_each(
     assert service.request("GET", f"/v1/jobs/{newest['id']}")["options"]["preset"] == "fast"
 
 
+@pytest.mark.exhaustive
 def test_cancelled_job_goes_on_with_other_files(
     service: RunningService, browse: Browse, folder: Path
 ) -> None:

@@ -39,6 +39,7 @@ def digests(service: RunningService, job: str) -> dict[str, str]:
     return {file["path"]: file["sha256"] for file in files}
 
 
+@pytest.mark.exhaustive
 def test_large_files_go_on_in_parts_and_known_ones_are_not_sent(
     service: RunningService, browse: Browse, photographs: Path
 ) -> None:

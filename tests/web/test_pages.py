@@ -178,6 +178,7 @@ def test_job_page_shows_result(flow: Flow, watched: dict[str, Any], browse: Brow
     assert found["viewerReady"] and found["complaints"] == []
 
 
+@pytest.mark.exhaustive
 def test_stage_form_renders_with_added_mesh(
     flow: Flow, watched: dict[str, Any], browse: Browse, tmp_path: Path
 ) -> None:
@@ -207,6 +208,7 @@ def test_stage_form_renders_with_added_mesh(
     ] == []  # one file is meant to be refused
 
 
+@pytest.mark.exhaustive
 def test_pages_are_usable_by_keyboard(
     flow: Flow, watched: dict[str, Any], browse: Browse, tmp_path: Path
 ) -> None:
@@ -247,6 +249,7 @@ def test_pages_fit_phone_in_both_color_schemes(flow: Flow, watched: dict[str, An
     ] == []  # one page is meant to be missing
 
 
+@pytest.mark.exhaustive
 def test_buttons_and_polling_without_events(flow: Flow, browse: Browse) -> None:
     dataset = flow.service.request("GET", f"/v1/jobs/{flow.job}")["dataset_id"]
     # A queue that nobody works on.

@@ -32,6 +32,7 @@ async def _job_with_scene(database: str, sha256: str, size_bytes: int, notes: li
     return str(job_id)
 
 
+@pytest.mark.exhaustive
 def test_notes_that_others_wrote_meanwhile_are_kept(
     service: RunningService, browse: Browse, database: str, tmp_path: Path
 ) -> None:

@@ -66,6 +66,7 @@ def test_view_serves_files_of_any_format_until_interrupted(
         assert process.returncode == 0 and "Error" not in complaints and "Traceback" not in complaints
 
 
+@pytest.mark.exhaustive
 def test_view_names_a_taken_port(scene: osp.Scene, tmp_path: Path) -> None:
     osp.save(scene, tmp_path / "scene.ply")
     with socket.create_server(("127.0.0.1", 0)) as other:

@@ -63,6 +63,7 @@ def test_blocks_are_trained_by_all_workers_and_one_job_is_seen(bench: WorkerHarn
     assert rows(bench, "jobs") == 0
 
 
+@pytest.mark.exhaustive
 def test_worker_killed_during_a_block_is_replaced(bench: WorkerHarness) -> None:
     first = bench.worker(name="first", **SOON)
     root = submit(bench, hold=1)
@@ -127,6 +128,7 @@ def test_failed_block_fails_the_whole_and_a_retry_keeps_what_succeeded(bench: Wo
     assert [child.attempt for child in blocks(bench, root)] == [1, 2, 1]
 
 
+@pytest.mark.exhaustive
 def test_cancelling_ends_all_blocks_and_a_retry_goes_on(bench: WorkerHarness) -> None:
     bench.worker(**KINDS)
     root = submit(bench, hold=1)

@@ -85,6 +85,7 @@ def run_task(
     return events, workspace
 
 
+@pytest.mark.exhaustive
 def test_programs_hand_over_what_makes_the_bytes_of_one_process(scene: Path, tmp_path: Path) -> None:
     kind = get_job_kind("reconstruct")
     complete = kind.resolve({**REQUESTED, "blocks": 2})

@@ -40,6 +40,7 @@ def test_job_exceeding_every_host_fails_before_start(bench: WorkerHarness) -> No
     assert job.error["type"] == "no_space" and f"at least {64 * MIB} bytes of disk" in job.error["message"]
 
 
+@pytest.mark.exhaustive
 def test_large_job_waits_for_space_while_others_run(bench: WorkerHarness) -> None:
     ballast = bench.folder / "ballast"
     ballast.write_bytes(bytes(12 * MIB))

@@ -1,9 +1,12 @@
 """Owners take turns, however many jobs each of them has queued."""
 
+import pytest
+
 from octasplat.workers.queue.fair_share import queue_position
 from tests.support.worker_harness import WorkerHarness
 
 
+@pytest.mark.exhaustive
 def test_owners_alternate_and_keep_their_order(bench: WorkerHarness) -> None:
     bench.worker()
     first = bench.submit(owner="a", options=bench.wait_until_held())

@@ -24,6 +24,7 @@ def bench(conninfo: str, tmp_path: Path) -> Iterator[WorkerHarness]:
         bench.close()
 
 
+@pytest.mark.exhaustive
 def test_jobs_wait_while_disk_space_is_short(bench: WorkerHarness) -> None:
     ballast = fill(bench.folder, 2 * MIB)
     bench.worker(FLOOR_BYTES=str(4 * MIB))
@@ -62,6 +63,7 @@ def test_job_on_full_disk_resumes_from_checkpoint(bench: WorkerHarness, floor_by
     assert len(reasons) == 1 and "lacks" in reasons[0]
 
 
+@pytest.mark.exhaustive
 def test_garbage_collection_frees_space_for_jobs(bench: WorkerHarness) -> None:
     storage = LocalStorage(bench.folder / "store", floor_bytes=0)
     with storage.open_writer() as writer:

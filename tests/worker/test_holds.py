@@ -38,6 +38,7 @@ def test_paused_queue_hands_out_nothing_and_another_one_does(bench: WorkerHarnes
     assert (finished.state, finished.attempt, finished.rescues) == ("succeeded", 1, 0)
 
 
+@pytest.mark.exhaustive
 def test_drained_worker_finishes_what_it_has_and_others_take_the_rest(bench: WorkerHarness) -> None:
     bench.worker(name="one")
     first = bench.submit(options=bench.wait_until_held())

@@ -36,6 +36,7 @@ def test_unusable_work_folder_does_not_count_against_jobs(bench: WorkerHarness) 
         assert (over.state, over.attempt, over.rescues) == ("succeeded", 1, 0)
 
 
+@pytest.mark.exhaustive
 def test_broken_library_does_not_count_against_jobs(
     bench: WorkerHarness, monkeypatch: pytest.MonkeyPatch
 ) -> None:

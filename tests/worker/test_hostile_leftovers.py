@@ -64,6 +64,7 @@ def test_canceled_job_with_a_held_pipe_frees_its_slot(shared_bench: WorkerHarnes
     assert shared_bench.wait_until_finished(later).state == "succeeded"
 
 
+@pytest.mark.exhaustive
 def test_daemons_end_when_their_worker_is_killed(bench: WorkerHarness) -> None:
     worker = start_worker(bench)
     job_id = bench.submit("hostile", options={"attack": "daemon", "lasts": True})
@@ -72,6 +73,7 @@ def test_daemons_end_when_their_worker_is_killed(bench: WorkerHarness) -> None:
     wait_for(lambda: not daemons(job_id), 30)
 
 
+@pytest.mark.exhaustive
 def test_shared_memory_does_not_pass_the_memory_limit(bench: WorkerHarness) -> None:
     start_worker(bench, MEMORY_LIMIT_BYTES=str(400 << 20))
     job_id = bench.submit("hostile", options={"attack": "shared memory", "size_bytes": 1 << 30})

@@ -50,6 +50,7 @@ def test_memory_is_shared_out_by_default(bench: WorkerHarness) -> None:
     assert 0 < limit < total / 2 and {"glb", "spz"} <= set(worker.facts["formats"])
 
 
+@pytest.mark.exhaustive
 def test_job_that_cannot_be_watched_is_stopped(bench: WorkerHarness) -> None:
     bench.worker(KIND_MODULES='["tests.support.broken_watch"]')
     job = bench.wait_until_finished(bench.submit(options={"steps": 100_000, "checkpoint_every": 1_000_000}))

@@ -2,6 +2,8 @@
 
 import time
 
+import pytest
+
 from octasplat.workers.storage.local import LocalStorage
 from tests.support.worker_harness import WorkerHarness
 
@@ -17,6 +19,7 @@ def test_job_with_unstorable_text_succeeds(bench: WorkerHarness) -> None:
     assert "takes no jobs" not in (bench.folder / "w.log").read_text() and worker.poll() is None
 
 
+@pytest.mark.exhaustive
 def test_results_beyond_the_quota_do_not_stay(bench: WorkerHarness) -> None:
     bench.worker(QUOTA_BYTES="1000000", COLLECT_SECONDS="1")
     jobs = [bench.submit(options={"steps": 1, "result_bytes": 2_000_000}) for _ in range(3)]

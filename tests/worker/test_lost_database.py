@@ -71,6 +71,7 @@ def test_lost_database_stops_the_child_before_others_take_over(bench: WorkerHarn
     assert next(e.data["step"] for e in bench.events(job_id) if e.kind == "resumed") >= 30
 
 
+@pytest.mark.exhaustive
 def test_unresponsive_child_of_draining_worker_is_killed_before_stale_limit(bench: WorkerHarness) -> None:
     worker = bench.worker(STALE_SECONDS=str(STALE_SECONDS), GRACE_SECONDS="600")
     job_id = bench.submit(options=bench.wait_until_held(deaf=True))
@@ -94,6 +95,7 @@ def test_reading_state_does_not_renew_heartbeat(bench: WorkerHarness) -> None:
         wait_for_end(child, STALE_SECONDS)
 
 
+@pytest.mark.exhaustive
 def test_unresponsive_database_counts_as_lost(bench: WorkerHarness) -> None:
     worker = bench.worker(STALE_SECONDS=str(STALE_SECONDS))
     job_id = bench.submit(options=bench.wait_until_held())

@@ -52,6 +52,7 @@ def seen(bench: WorkerHarness) -> bool:
     return bool(bench.run_query(lambda connection: live_workers(connection, 1.0)))
 
 
+@pytest.mark.exhaustive
 def test_periodic_task_is_retried_and_repeated_failure_ends_worker(bench: WorkerHarness) -> None:
     worker = bench.worker(HEARTBEAT_SECONDS="0.2")
     bench.wait_until_up("w")
@@ -73,6 +74,7 @@ def test_periodic_task_is_retried_and_repeated_failure_ends_worker(bench: Worker
     assert (bench.job(job).state, bench.job(job).rescues) == ("queued", 0)
 
 
+@pytest.mark.exhaustive
 def test_progress_events_are_thinned(bench: WorkerHarness) -> None:
     job = bench.submit(options=bench.wait_until_held(steps=40))
     with psycopg.connect(bench.conninfo) as connection:

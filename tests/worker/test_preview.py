@@ -66,6 +66,7 @@ def told_steps(run: Path, told: list[Event]) -> list[int]:
     return [event.step for event in found]
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("materials", [False, pytest.param(True, marks=pytest.mark.exhaustive)])
 def test_previews_do_not_change_training(scene: Path, tmp_path: Path, clock: Clock, materials: bool) -> None:
     config = watched_config(materials=materials)

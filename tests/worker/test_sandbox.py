@@ -88,6 +88,7 @@ def test_sandboxed_model_reader_cannot_write_or_connect(tmp_path: Path) -> None:
     assert set(found.values()) == {"PermissionError"} and not list(tmp_path.rglob("planted"))
 
 
+@pytest.mark.exhaustive
 def test_missing_sandbox_capabilities_are_logged_once(short_root: Path, tmp_path: Path) -> None:
     data, log = short_root / "unshielded", tmp_path / "log"
     command = [sys.executable, "-c", WITHOUT_LANDLOCK, "serve", "--port", "0", "--data", str(data)]
@@ -120,6 +121,7 @@ def start_numba_threads(_task: object) -> None:
     numba.set_num_threads(1)
 
 
+@pytest.mark.exhaustive
 def test_log_of_a_job_does_not_tell_of_locks_that_it_needs_not(tmp_path: Path) -> None:
     task = {
         "kind_modules": [],

@@ -100,6 +100,7 @@ def texts(bench: WorkerHarness, job: uuid.UUID) -> str:
     return "\n".join([bench.log(job), json.dumps(error), *(str(e.data) for e in bench.events(job))])
 
 
+@pytest.mark.exhaustive
 def test_training_begins_with_what_another_job_has_made(
     shared_bench: WorkerHarness, dataset: uuid.UUID, finished: uuid.UUID
 ) -> None:

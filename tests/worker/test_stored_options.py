@@ -164,6 +164,7 @@ async def test_changes_by_the_last_version_count(connect_service: ConnectService
         assert await requested_of(service, job) is None
 
 
+@pytest.mark.exhaustive
 async def test_worker_of_a_version_with_other_defaults_completes_what_was_asked_for(
     connect_service: ConnectService, conninfo: str, tmp_path: Path
 ) -> None:

@@ -287,6 +287,7 @@ def test_releases_go_on_with_jobs_of_each_other(service: Service) -> None:
     assert ("begins anew" in bench.log(handed_back)) != (len(service.begun_twice(30)) == 2)
 
 
+@pytest.mark.exhaustive
 async def test_previous_release_takes_jobs_of_current_front_end(
     postgres: EmbeddedPostgres, previous: Release, tmp_path: Path
 ) -> None:

@@ -72,6 +72,7 @@ def test_killed_child_is_started_again_from_the_checkpoint(shared_bench: WorkerH
     assert len(rescued) == 1 and "signal 9" in rescued[0]["reason"]
 
 
+@pytest.mark.exhaustive
 def test_frozen_worker_is_fenced_on_return(bench: WorkerHarness) -> None:
     first = bench.worker(name="first", **SOON)
     job_id = bench.submit(options=bench.wait_until_held())
@@ -101,6 +102,7 @@ def test_crashing_job_fails_with_reason(shared_bench: WorkerHarness) -> None:
     assert "signal 11" in job.error["message"] and "4 times" in job.error["message"]
 
 
+@pytest.mark.exhaustive
 def test_job_killing_its_worker_fails(bench: WorkerHarness) -> None:
     """The rescue counts, as no worker lives to do so."""
     bench.worker(queues="", name="care", **SOON)
@@ -177,6 +179,7 @@ def test_queued_job_is_cancelled_without_a_worker(bench: WorkerHarness) -> None:
     assert bench.job(job_id).attempt == 0
 
 
+@pytest.mark.exhaustive
 def test_silent_program_is_tried_once_more(bench: WorkerHarness) -> None:
     bench.worker(SILENT_SECONDS="0.8")
     job_id = bench.submit(options={"steps": 20, "silent_at": 15, "checkpoint_every": 5})
@@ -186,6 +189,7 @@ def test_silent_program_is_tried_once_more(bench: WorkerHarness) -> None:
     assert job.error is not None and job.error["type"] == "silent" and "2 times" in job.error["message"]
 
 
+@pytest.mark.exhaustive
 def test_program_exceeding_memory_limit_is_stopped(bench: WorkerHarness) -> None:
     bench.worker(MEMORY_LIMIT_BYTES=str(400 << 20))
     job_id = bench.submit(options={"steps": 1000, "hog_bytes": 600 << 20})
