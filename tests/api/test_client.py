@@ -61,6 +61,7 @@ SMALL = {
 }
 
 
+@pytest.mark.exhaustive
 def test_client_submit_and_download_round_trip(service: Service, photographs: Path, tmp_path: Path) -> None:
     events: list[Event] = []
     with osp.Client(service.url, service.token) as client:

@@ -37,6 +37,9 @@ def front_end(conninfo: str, folder: Path) -> Iterator[tuple[str, int]]:
             process.wait(60)
 
 
+CODINGS = [b"Transfer-Encoding: chunked", b"transfer-encoding: Chunked"]
+
+
 def answers(address: tuple[str, int], sent: bytes) -> bytes:
     """Everything that comes back until the service closes the connection."""
     with socket.create_connection(address, timeout=30) as connection:
@@ -47,12 +50,7 @@ def answers(address: tuple[str, int], sent: bytes) -> bytes:
         return got
 
 
-@pytest.mark.parametrize(
-    "coding",
-    some_daily(
-        [b"Transfer-Encoding: chunked", b"transfer-encoding: Chunked"], [b"transfer-encoding: Chunked"]
-    ),
-)
+@pytest.mark.parametrize("coding", some_daily(CODINGS, CODINGS[1:]))
 def test_request_with_two_lengths_is_refused_and_connection_closed(
     conninfo: str, tmp_path: Path, coding: bytes
 ) -> None:
