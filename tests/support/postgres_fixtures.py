@@ -38,7 +38,7 @@ def postgres(short_root: Path) -> Iterator[EmbeddedPostgres]:
         connection.execute("ALTER SYSTEM SET fsync = off")
         connection.execute("SELECT pg_reload_conf()")
     yield server
-    administration.cache_clear()
+    administration(server).close()
     # At once, as nothing here is worth the flushing.
     os.kill(int((server.cluster / "postmaster.pid").read_text().split()[0]), signal.SIGQUIT)
 
@@ -54,7 +54,7 @@ def template(postgres: EmbeddedPostgres) -> str:
 def copied_database(postgres: EmbeddedPostgres, template: str) -> Iterator[str]:
     """A new database made from ``template``, dropped at the end."""
     name = f"test_{uuid.uuid4().hex[:12]}"
-    connection = administration(make_conninfo(postgres.conninfo(), dbname="postgres"))
+    connection = administration(postgres)
     # Files are copied faster than pages, as nothing is flushed here.
     command = f'CREATE DATABASE "{name}" TEMPLATE "{template}" STRATEGY FILE_COPY'
     connection.execute(command.encode())
@@ -63,9 +63,9 @@ def copied_database(postgres: EmbeddedPostgres, template: str) -> Iterator[str]:
 
 
 @functools.cache
-def administration(conninfo: str) -> psycopg.Connection:
+def administration(postgres: EmbeddedPostgres) -> psycopg.Connection:
     """A connection that stays, as the first copy of a database costs it four times what the next ones do."""
-    return psycopg.connect(conninfo, autocommit=True)
+    return psycopg.connect(make_conninfo(postgres.conninfo(), dbname="postgres"), autocommit=True)
 
 
 @pytest.fixture

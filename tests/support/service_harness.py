@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import httpx
+from fastapi import routing
 from pydantic import SecretStr
 
 from octasplat.service.app import create_app
@@ -23,6 +24,25 @@ from octasplat.workers.storage.trees import Manifest
 TOKEN = new_secret()
 """What the clients of these services send unless a test says otherwise."""
 BEARER = {"Authorization": f"Bearer {TOKEN}"}
+
+
+def share_routes() -> None:
+    """Let FastAPI work through each route once, and not once for each application: 0.1 s of most tests.
+
+    All of them include the same routers in the same way.
+    """
+    make = routing._EffectiveRouteContext.from_api_route
+    made: dict[int, Any] = {}
+
+    def make_once(*, original_route: routing.APIRoute, include_context: Any) -> Any:
+        if id(original_route) not in made:
+            made[id(original_route)] = make(original_route=original_route, include_context=include_context)
+        return made[id(original_route)]
+
+    routing._EffectiveRouteContext.from_api_route = make_once  # type: ignore[assignment, method-assign]
+
+
+share_routes()
 
 
 async def add_local_token(conninfo: str) -> None:
