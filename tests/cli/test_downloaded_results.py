@@ -40,7 +40,9 @@ def results(scene, tmp_path_factory) -> Results:
     """Made by the program of the job kind itself, in a folder that is gone afterwards."""
     root = tmp_path_factory.mktemp("job")
     shutil.copytree(scene, root / "dataset")
-    config = resolve_config("fast", settings={"test_every": 4, "max_side": 48}, assignments=SETTINGS)
+    config = resolve_config(
+        "fast", settings={"test_every": 4, "max_side": 48, "exports": ("viewer.glb",)}, assignments=SETTINGS
+    )
     options = get_job_kind("reconstruct").options.model_validate(config.model_dump(mode="json"))
     left = root / "attempt" / "run" / "config.json"  # by an attempt of another version
     left.parent.mkdir(parents=True)

@@ -144,6 +144,7 @@ const steps = {
         await page.fill("[data-path='train.iterations']", "1000000000");
         found.tooMuch = await estimate("100000");
         for (const [path, value] of Object.entries(job.options)) await page.fill(`[data-path='${path}']`, String(value));
+        for (const box of await page.locator("[data-path=exports] [type=checkbox]:enabled").all()) await box.setChecked(job.exports.includes(await box.inputValue()));
         found.estimateAnew = await estimate("of memory");
         await shot(page, "new_settings");
         found.namelessOnNew = await nameless(page);

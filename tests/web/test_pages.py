@@ -24,7 +24,7 @@ pytestmark = [pytest.mark.tools, pytest.mark.heavy]
 
 VIEWS = 8
 OPTIONS = {
-    "train.iterations": 300,
+    "train.iterations": 150,
     "train.max_gaussians": 800,
     "train.rays_per_batch": 1024,
     "train.initial_points": 600,
@@ -69,6 +69,7 @@ def flow(start_service: StartService, browse: Browse, folder: Path, tmp_path_fac
         empty=str(empty),
         first=5,
         options=OPTIONS,
+        exports=["octagons.ply"],
     )
     return Flow(service, folder, facts, facts["job"])
 
@@ -133,7 +134,8 @@ def test_form_submits_filled_values(flow: Flow) -> None:
     options = job["options"]
     assert job["label"] == "a still life"
     assert options["preset"] == "fast" and options["poses"] == "given" and options["test_every"] == 4
-    assert options["train"]["iterations"] == 300 and options["train"]["rays_per_batch"] == 1024
+    assert options["exports"] == ["octagons.ply"]
+    assert options["train"]["iterations"] == 150 and options["train"]["rays_per_batch"] == 1024
     # Of the preset, as the field was left empty.
     assert options["train"]["sh_degree_interval"] == preset("fast").sh_degree_interval
     assert flow.facts["iterationsHint"] == str(preset("fast").iterations)  # the hint follows the preset
@@ -157,7 +159,7 @@ def test_job_page_follows_progress_to_end(watched: dict[str, Any]) -> None:
     assert watched["stages"], "no stage was shown by its name"
     assert watched["liveCurves"] == 3 and watched["curves"] == 3
     assert "held-out views" in watched["figures"][0] and "training rays" in watched["figures"][0]
-    assert "Trained 300 iterations in" in watched["log"] and "Attempt 1" in watched["log"]
+    assert "Trained 150 iterations in" in watched["log"] and "Attempt 1" in watched["log"]
     assert watched["preview"]
     assert watched["view"]["deviation"] > 15  # there is a picture in the viewer
     assert watched["nameless"] == []
