@@ -1,6 +1,6 @@
 """The gallery of ``docs/gallery.md``: generated scenes, reconstructed anew, at the same views each time.
 
-    python -m benchmarks.gallery                               # some ten CPU minutes; writes into docs/
+    python -m benchmarks.gallery                               # some fifteen CPU minutes; writes into docs/
     python -m benchmarks.gallery --scenes table street         # these alone
     python -m benchmarks.gallery -o NEW --compare docs         # beside the pictures and figures of docs/
 
