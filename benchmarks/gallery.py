@@ -94,7 +94,7 @@ def write_page(output: Path, gallery: Gallery, earlier: Gallery | None = None) -
     for name, part in parts.items():
         if not has_part(text, name, PROGRAM):
             begin, end = marks(name, PROGRAM)
-            heading = f"## {SCENES[name].title}\n\n{SCENES[name].about}\n\n" if name in SCENES else ""
+            heading = f"## {SCENES[name].title}\n\n" if name in SCENES else ""
             text = f"{text.rstrip()}\n\n{heading}{begin}\n{end}\n"
         text = with_part(text, name, PROGRAM, part, page=path.name)
     write_text(path, text)
@@ -130,8 +130,8 @@ def figures_table(gallery: Gallery, earlier: Gallery | None = None) -> str:
 
 
 def scene_part(name: str, figures: SceneFigures, earlier: SceneFigures | None = None) -> str:
-    """Return the pictures of a scene with what they show; with those of an earlier gallery below each."""
-    lines = []
+    """Return what a scene is, and its pictures; with those of an earlier gallery below each."""
+    lines = [SCENES[name].about, ""]
     for strip in STRIPS:
         caption = _caption(strip, figures)
         lines += [f"{caption}:", "", f"![{caption}]({(PICTURES / f'{name}_{strip}.jpg').as_posix()})", ""]
