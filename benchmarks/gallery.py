@@ -112,7 +112,7 @@ def figures_table(gallery: Gallery, earlier: Gallery | None = None) -> str:
         lambda row: _share(row.ssim),
         lambda row: _decibels(row.worst_now.psnr),
         lambda row: f"{row.gaussians:,}",
-        lambda row: "" if row.cpu_seconds is None else f"{row.cpu_seconds:,.0f} s",
+        lambda row: "not measured" if row.cpu_seconds is None else f"{row.cpu_seconds:,.0f} s",
         lambda row: row.preset,
         lambda row: f"{row.version}, results {row.results_version}",
     )

@@ -66,11 +66,13 @@ def _kettle(root: Path) -> None:
     from benchmarks.material_thing_skies import SKIES
     from benchmarks.material_things import CHOOSING, Sizes, write_thing
 
-    sizes = Sizes(side=240, test_views=1, relit_views=0)
+    sizes = Sizes(train_views=48, train_samples=12, test_views=1, relit_views=0)
     sky = CHOOSING["kettle"]
     write_thing(root, "kettle", THINGS["kettle"](), {sky: SKIES[sky](sizes.sky_height)}, sizes)
-    for truth in ("env", "test"):  # which a reconstruction would warn of
+    # Beside the photographs a reconstruction would warn of them.
+    for truth in ("env", "test"):
         shutil.rmtree(root / truth)
+    (root / "truth.json").unlink()
 
 
 _TABLE = SyntheticDatasetConfig()
@@ -117,8 +119,8 @@ SCENES: Mapping[str, GalleryScene] = {
     ),
     "kettle": GalleryScene(
         "A shiny kettle",
-        "Steel beside paint, thin wires, wood (`benchmarks.material_things`, by Mitsuba): 64 photographs of "
-        "240 x 240 px with alpha, reconstructed without materials.",
+        "Steel beside paint, thin wires, wood (`benchmarks.material_things`, by Mitsuba): 48 photographs of "
+        "200 x 200 px with alpha, reconstructed without materials.",
         _kettle,
         needs="mitsuba",
     ),
