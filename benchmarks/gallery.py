@@ -124,7 +124,7 @@ def figures_table(gallery: Gallery, earlier: Gallery | None = None) -> str:
         for column in columns:
             now, then = column(row), "" if before is None else column(before)
             cells.append(f"{now} ({then})" if then and then != now else now)
-        about = f"{scene.title}, {row.photographs} photographs, {row.held_out} held out"
+        about = f"{scene.title}: {row.photographs} photographs, {row.held_out} held out"
         lines.append(f"| {' | '.join([about, *cells])} |")
     return "\n".join(lines)
 
