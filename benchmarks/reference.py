@@ -15,6 +15,7 @@ from typing import Any
 
 import click
 
+from benchmarks.marked_parts import with_part
 from octasplat.__main__ import cli
 from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.cost_model import estimate_reconstruction
@@ -29,8 +30,6 @@ from octasplat.workers.settings import PREFIX, WorkerSettings
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 WRITTEN_BY = "This page is written by `python -m benchmarks.reference --write`."
 ESTIMATES_PAGE = "time_and_memory.md"
-BEGIN = "<!-- estimates: by python -m benchmarks.reference --write -->"
-END = "<!-- end of estimates -->"
 MEGAPIXELS = ((1_600, 1_200), (4_000, 3_000), (6_000, 4_000))
 COUNTS = (20, 50, 100, 200, 500)
 PRESETS = ("fast", "standard", "high")
@@ -117,11 +116,8 @@ def service_settings_page() -> str:
 def estimates_page() -> str:
     """Return ``docs/time_and_memory.md`` with its table made anew."""
     text = (DOCS / ESTIMATES_PAGE).read_text(encoding="utf-8")
-    before, found, rest = text.partition(BEGIN)
-    _, closed, after = rest.partition(END)
-    if not found or not closed:
-        raise SystemExit(f"docs/{ESTIMATES_PAGE} has no part between '{BEGIN}' and '{END}'.")
-    return f"{before}{BEGIN}\n\n{estimates_table()}\n\n{END}{after}"
+    program = "benchmarks.reference --write"
+    return with_part(text, "estimates", program, estimates_table(), page=f"docs/{ESTIMATES_PAGE}")
 
 
 def estimates_table() -> str:
