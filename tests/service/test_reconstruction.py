@@ -251,6 +251,7 @@ def test_restarted_service_continues_and_derived_jobs_use_result(
             download_results(api, job["id"], tmp_path, names=("nothing",))
 
 
+@pytest.mark.exhaustive
 def test_killed_database_is_restarted(machine: Machine, scene: Path) -> None:
     with machine.api as api:
         job = submit(api, Submission(scene, {**OPTIONS, "exports": []}))
