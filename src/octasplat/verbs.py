@@ -731,12 +731,13 @@ def surface(
         refine_vertices: Move vertices along their normals to where the pictures agree, before colors.
         keep_components: Keep so many connected parts only, largest first. [default: by min_component]
         min_component: Remove parts of less than this share of the largest part's area. Default: 0.01.
-        fill_holes: Close holes with rims shorter than so many voxels; or 'all'. Default: 0.0.
+        fill_holes: Close holes whose rim is no longer than so many voxels; or 'all'. Default: 0.0.
         fit: Of all colors, take those with which the mesh looks as like the pictures as it can.
-        texture_size: Colors in a square texture of this side instead of in the vertices; .glb and .obj.
+        texture_size: Colors in a square texture of this side instead of in the vertices; .glb, .obj and
+            .usdz.
         max_memory_gb: Refuse a volume that takes more memory than this. Default: 4.0.
         room: What pictures of a room need, where nothing else is said: unbounded, unseen solid,
-            backdrop, settle and finer voxels.
+            backdrop, refine_vertices, and finer voxels than a box has.
         max_triangles: Decimate to so many triangles, such as 60000 or 60k; 5k,50k,500k writes a file
             each, NAME_5k.glb. [default: all]
         materials: Base color, metallic, roughness and normals in textures, to be lit; .glb or .usdz.
