@@ -45,8 +45,9 @@ def commands_page() -> str:
         "# Commands",
         "",
         f"{WRITTEN_BY} `octasplat COMMAND --help` shows the same in the terminal. Every command ends with "
-        "status 0 where it did what was asked, 1 with one sentence where it could not, and 2 where its "
-        "options are wrong.",
+        "status 0 where it did what was asked, 1 with one sentence where it could not or cannot use a value, "
+        "and 2 where the command line is wrong: options that are unknown, missing, out of range, or do not go "
+        "together.",
         "",
     ]
     for context in _commands(click.Context(cli, info_name="octasplat")):

@@ -736,8 +736,8 @@ def surface(
         texture_size: Colors in a square texture of this side instead of in the vertices; .glb, .obj and
             .usdz.
         max_memory_gb: Refuse a volume that takes more memory than this. Default: 4.0.
-        room: What pictures of a room need, where nothing else is said: unbounded, unseen solid,
-            backdrop, refine_vertices, and finer voxels than a box has.
+        room: What pictures of a room need, where nothing else is said: unbounded (not with bounds),
+            unseen solid, backdrop, refine_vertices, and finer voxels than a box has.
         max_triangles: Decimate to so many triangles, such as 60000 or 60k; 5k,50k,500k writes a file
             each, NAME_5k.glb. [default: all]
         materials: Base color, metallic, roughness and normals in textures, to be lit; .glb or .usdz.
