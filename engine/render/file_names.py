@@ -6,6 +6,11 @@ from pathlib import Path
 
 IMAGE_SUFFIXES = (".png", ".exr")
 """Of names that mean images; other names mean a folder, or a film."""
+UNWRITTEN_SUFFIXES = frozenset(
+    {".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".gif", ".avif", ".hdr"}
+    | {".mov", ".m4v", ".mkv", ".avi", ".webm"}
+)
+"""Of names that mean pictures or films in formats that are not written."""
 
 
 def unique_render_names(photographs: Sequence[str]) -> tuple[str, ...]:

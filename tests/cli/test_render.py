@@ -175,6 +175,8 @@ def test_render_invalid_camera_path_is_named(run, octasplat, tmp_path):
     [
         ["-o", "turn.mp4", "--views", "all"],
         ["-o", "turn.mp4", "--turntable", "--exr"],
+        ["-o", "turn.gif", "--turntable"],
+        ["-o", "frames/%04d.jpg", "--turntable"],
         ["-o", "one.png", "--turntable"],
         ["-o", "some_%d.png", "--exr"],
         ["-o", "out", "--turntable", "--views", "all"],
