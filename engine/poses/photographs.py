@@ -17,6 +17,7 @@ from octasplat.engine.core.scene_layout import (
 )
 from octasplat.engine.dataset.model_sources import has_model
 from octasplat.engine.dataset.photograph_files import image_folder
+from octasplat.engine.dataset.results_among import is_run_folder
 
 
 def locate_scene(folder: Path) -> Path:
@@ -37,10 +38,17 @@ def photographs_of_scene(scene: Path) -> list[str]:
     beside photographs, as ``a_mask.png`` of ``a.jpg``.
 
     Raises:
-        DatasetError: it is no folder, or there are fewer than three; the text names what is left out.
+        DatasetError: it is no folder, or that of a run, or there are fewer than three; the text names what is
+            left out.
     """
     _check_folder(scene)
-    layout, folder = _layout_of(scene), image_folder(scene)
+    folder = image_folder(scene)
+    if folder == scene and is_run_folder(scene):
+        raise DatasetError(
+            f"{scene} is the folder of a run, whose pictures are no photographs; name the folder of the "
+            "photographs."
+        )
+    layout = _layout_of(scene)
     images = {name: path for name, path in layout.files.items() if name.startswith(IMAGES)}
     masks = masks_beside(images)
     names = sorted(
