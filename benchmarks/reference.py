@@ -45,9 +45,10 @@ def commands_page() -> str:
         "# Commands",
         "",
         f"{WRITTEN_BY} `octasplat COMMAND --help` shows the same in the terminal. Every command ends with "
-        "status 0 where it did what was asked, 1 with one sentence where it could not or cannot use a value, "
-        "and 2 where the command line is wrong: options that are unknown, missing, out of range, or do not go "
-        "together. A signal that ended it makes 130 (Ctrl-C) or 143 (SIGTERM), a fault of octasplat's own 70.",
+        "status 0 where it did what was asked, 1 with one sentence where it could not or cannot use a "
+        "value, and 2 where the command line is wrong: options that are unknown, missing, out of range, or "
+        "do not go together. A signal that ended it makes 130 (Ctrl-C) or 143 (SIGTERM), a fault of "
+        "octasplat's own 70.",
         "",
     ]
     for context in _commands(click.Context(cli, info_name="octasplat")):

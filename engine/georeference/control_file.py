@@ -6,8 +6,9 @@ Two forms are read, told apart by their content:
 ``x y z px py photograph name``, apart by blanks or tabs.
 
 A CSV with a line of names: ``name,x,y,z,photograph,px,py``, a row for each sighting; a comment
-``# EPSG:32632`` or ``# WGS84 UTM 32N`` says the coordinate system. A row without a photograph is one of a photograph (its camera's
-position) or of a sparse point (its number), by ``name``. Points without ``x,y,z`` are for known lengths.
+``# EPSG:32632`` or ``# WGS84 UTM 32N`` says the coordinate system. A row without a photograph is one of a
+photograph (its camera's position) or of a sparse point (its number), by ``name``. Points without ``x,y,z``
+are for known lengths.
 """
 
 import csv
@@ -101,7 +102,7 @@ def read_control_file(path: Path) -> ControlFile:
     is_csv = bool(content) and "," in content[0][1] and "name" in _csv_names(content[0][1])
     if is_csv:
         comments = [line.lstrip("# ") for _, line in numbered if line.startswith("#")]
-        # A number is sure to be meant; any other system, too, rather than that its points were taken as local.
+        # a number comes first; any other system is read or refused, so that its points are not taken as local
         found = [line for pattern in (_EPSG, _OTHER_SYSTEM) for line in comments if pattern.search(line)]
         stated = next(iter(found), "")
         rows = _csv_rows(path, content)

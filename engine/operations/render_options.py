@@ -273,8 +273,8 @@ class PictureRequest(PictureOptions, WritingRequest):
         suffix = self.output.suffix.lower()
         if suffix in UNWRITTEN_SUFFIXES and not self.output.is_dir():
             raise ValueError(
-                f"{self.output}: images are written as .png or .exr, and videos as .mp4; name one of these, or "
-                "a folder"
+                f"{self.output}: images are written as .png or .exr, and videos as .mp4; name one of these, "
+                "or a folder"
             )
         if (suffix == ".mp4") != (self.format == "mp4"):
             if suffix == ".mp4":

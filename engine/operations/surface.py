@@ -83,8 +83,8 @@ class SurfaceOptions(ExtractionOptions, Options):
 
     room: bool = Field(
         False,
-        description="What pictures of a room need, where nothing else is said: unbounded (not with bounds), unseen solid, "
-        "backdrop, refine_vertices, and finer voxels than a box has.",
+        description="What pictures of a room need, where nothing else is said: unbounded (not with bounds), "
+        "unseen solid, backdrop, refine_vertices, and finer voxels than a box has.",
     )
     max_triangles: Annotated[
         tuple[str, ...],

@@ -70,9 +70,9 @@ def test_what_is_no_picture_is_refused(scene_file: Path) -> None:
         with pytest.raises(osp.ConfigError, match=f"^{next(iter(place))}: "):
             osp.view(scene, open_browser=False, **place)
     for size, fov in (((0, 12), 50.0), ((16, 12), 200.0), ((16, 12), 0.0)):
-        with pytest.raises(osp.ConfigError, match="must be at least 1|between 0 and 180"):
+        with pytest.raises(osp.ConfigError, match=r"must be at least 1|between 0 and 180"):
             scene.camera(*size, fov=fov)
-        with pytest.raises(osp.ConfigError, match="must be at least 1|between 0 and 180"):
+        with pytest.raises(osp.ConfigError, match=r"must be at least 1|between 0 and 180"):
             osp.Camera.looking_at((0, 0, -4), (0, 0, 0), *size, fov_y_degrees=fov)
 
 
