@@ -33,7 +33,9 @@ class ReconstructionConfig(RunSettings):
 
     train: TrainConfig = Field(TrainConfig(), description="The settings of the training.")
     evaluation_background: Annotated[Literal["black", "white"], ADVANCED] = Field(
-        "black", description="What lies behind renders and photographs with alpha when they are compared."
+        "black",
+        description="What lies behind renders and photographs with alpha when they are compared; by default "
+        "that of the training: white where background is white, else black.",
     )
 
     @model_validator(mode="before")
