@@ -79,8 +79,8 @@ def http_page() -> str:
         "[HTTP by example](service.md) has examples.",
         "",
         "A GET and `POST /v1/estimates` need a token with the scope `read`, every other request one with "
-        "`write`, unless its text says otherwise ([rights of tokens](service.md#rights-of-tokens)); `/healthz` "
-        "and `/readyz` need none.",
+        "`write`, unless its text says otherwise ([rights of tokens](service.md#rights-of-tokens)); "
+        "`/healthz` and `/readyz` need none.",
         "",
         "Every request may also be answered by 400 (malformed), 401 (no valid token), 403 (the token's scope "
         "does not suffice), 421 (a foreign host name), 422 (refused, with the reasons under `errors`), "

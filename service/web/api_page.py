@@ -112,7 +112,7 @@ def _type_text(schema: Mapping[str, Any]) -> str:
 
 
 def _range_text(schema: Mapping[str, Any]) -> str:
-    """Return what a number may be, and what a parameter is if it is not given; empty where nothing is said."""
+    """Return the range of a number and the default of a parameter, behind its type; empty without either."""
     least, most, default = schema.get("minimum"), schema.get("maximum"), schema.get("default")
     text = ""
     if least is not None:
