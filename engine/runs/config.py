@@ -202,8 +202,9 @@ def read_config(path: Path) -> ReconstructionConfig:
     except InvalidSettingsError as error:  # not told as damage: the file is of another version
         raise ConfigError(f"{path} is not a configuration of this version: {error}") from None
     except (OSError, ValueError, KeyError, TypeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
         raise ConfigError(
-            f"{path} cannot be read ({error}); name the folder of a finished or stopped run."
+            f"{path} cannot be read ({reason}); name the folder of a finished or stopped run."
         ) from None
 
 
