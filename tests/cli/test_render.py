@@ -183,6 +183,7 @@ def test_render_invalid_camera_path_is_named(run, octasplat, tmp_path):
         ["-o", "one.png", "--camera", "0", "0", "1", "--distance", "3"],
         ["-o", "out", "--views", "all", "--look-at", "0", "0", "1"],
         ["-o", "one.mp4", "--turntable", "--background", "transparent"],
+        ["-o", "one.jpg", "--camera", "0", "0", "1"],
     ],
 )
 def test_contradictions_are_usage_errors(run, octasplat, arguments):
