@@ -269,8 +269,8 @@ class PictureRequest(PictureOptions, WritingRequest):
         suffix = self.output.suffix.lower()
         if suffix in UNWRITTEN_SUFFIXES:
             raise ValueError(
-                f"{self.output}: images are written as .png or .exr and films as .mp4; name one of these, or a "
-                "folder"
+                f"{self.output}: images are written as .png or .exr and films as .mp4; name one of these, or "
+                "a folder"
             )
         if (suffix == ".mp4") != (self.format == "mp4"):
             if suffix == ".mp4":
