@@ -84,7 +84,7 @@ class SurfaceOptions(ExtractionOptions, Options):
     room: bool = Field(
         False,
         description="What pictures of a room need, where nothing else is said: unbounded, unseen solid, "
-        "backdrop, settle and finer voxels.",
+        "backdrop, refine-vertices and finer voxels.",
     )
     max_triangles: Annotated[
         tuple[str, ...],
