@@ -94,8 +94,9 @@ def read_control_file(path: Path) -> ControlFile:
             raise ConfigError(f"{path} has more than {MAX_BYTES / 1e6:.0f} MB; control points take less.")
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
         raise ConfigError(
-            f"{path} cannot be read as text ({error}); name a file of control points."
+            f"{path} cannot be read as text ({reason}); name a file of control points."
         ) from None
     numbered = [(number, line.strip()) for number, line in enumerate(lines, 1) if line.strip()]
     content = [(number, line) for number, line in numbered if not line.startswith("#")]

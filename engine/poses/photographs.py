@@ -24,7 +24,7 @@ def locate_scene(folder: Path) -> Path:
     """Return the scene that ``folder`` is, or the one below it where there is nothing beside that.
 
     Raises:
-        DatasetError: it is no folder.
+        DatasetError: it is no folder, or that of a run.
     """
     _check_folder(folder)
     inner = folder / _layout_of(folder).folder
@@ -42,13 +42,7 @@ def photographs_of_scene(scene: Path) -> list[str]:
             left out.
     """
     _check_folder(scene)
-    folder = image_folder(scene)
-    if folder == scene and is_run_folder(scene):
-        raise DatasetError(
-            f"{scene} is the folder of a run, whose pictures are no photographs; name the folder of the "
-            "photographs."
-        )
-    layout = _layout_of(scene)
+    layout, folder = _layout_of(scene), image_folder(scene)
     images = {name: path for name, path in layout.files.items() if name.startswith(IMAGES)}
     masks = masks_beside(images)
     names = sorted(
@@ -69,6 +63,10 @@ def notes_on_files(scene: Path) -> tuple[str, ...]:
 def _check_folder(scene: Path) -> None:
     if not scene.is_dir():
         raise DatasetError(f"{scene} is not a folder; name the folder that holds the photographs.")
+    if is_run_folder(scene) and image_folder(scene) == scene:  # its renders would be taken for photographs
+        raise DatasetError(
+            f"{scene} is the folder of a run; name the folder that holds the photographs it was made of."
+        )
 
 
 def _layout_of(scene: Path) -> SceneLayout:

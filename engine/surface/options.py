@@ -127,8 +127,8 @@ class ExtractionOptions(BaseModel):
         None,
         ge=64,
         le=16384,
-        description="Colors in a square texture of this side instead of in the vertices; .glb, .obj "
-        "and .usdz.",
+        description="Colors in a square texture of this side instead of in the vertices; .glb, .obj and "
+        ".usdz.",
     )
     max_memory_gb: Annotated[float, Unit("GB"), Spelling(("--max-memory",), metavar="GB")] = Field(
         4.0, gt=0, description="Refuse a volume that takes more memory than this."

@@ -151,8 +151,7 @@ def reconstruct(
         depth_unit: World units for one unit of the values of depth maps (depths/); by default the
             sparse points decide, or metres where there are too few (0.001 for integers).
         evaluation_background: What lies behind renders and photographs with alpha when they are
-            compared; by default that of the training: white where train.background is white, else
-            black.
+            compared; by default that of the training: white where background is white, else black.
         georeference: What says where the scene lies, how large it is, and what is up: auto takes
             control points, else the GPS positions in the photographs where they agree with the scene;
             gps refuses the photographs where these do not; off looks for nothing, so that no file says
@@ -316,8 +315,7 @@ def estimate(
         depth_unit: World units for one unit of the values of depth maps (depths/); by default the
             sparse points decide, or metres where there are too few (0.001 for integers).
         evaluation_background: What lies behind renders and photographs with alpha when they are
-            compared; by default that of the training: white where train.background is white, else
-            black.
+            compared; by default that of the training: white where background is white, else black.
         georeference: What says where the scene lies, how large it is, and what is up: auto takes
             control points, else the GPS positions in the photographs where they agree with the scene;
             gps refuses the photographs where these do not; off looks for nothing, so that no file says
@@ -474,8 +472,7 @@ def plan(
         depth_unit: World units for one unit of the values of depth maps (depths/); by default the
             sparse points decide, or metres where there are too few (0.001 for integers).
         evaluation_background: What lies behind renders and photographs with alpha when they are
-            compared; by default that of the training: white where train.background is white, else
-            black.
+            compared; by default that of the training: white where background is white, else black.
         georeference: What says where the scene lies, how large it is, and what is up: auto takes
             control points, else the GPS positions in the photographs where they agree with the scene;
             gps refuses the photographs where these do not; off looks for nothing, so that no file says
@@ -943,8 +940,8 @@ def render(
         resume: Go on with a render that was stopped, if there is one.
         or_anew: Begin anew where the images that are there are of another render.
         frames_folder: Where a video keeps its frames until it is whole. [default: beside it]
-        background: Behind the scene; transparent gives images alpha. [default: that of the run's
-            evaluation, or black]
+        background: Behind the scene; transparent gives images alpha. [default: what the run has learnt,
+            or that of its evaluation; of a file black]
         stage: Meshes, lights and materials that the scene is rendered with, as docs/light.md describes:
             an object, or the text of a stage file. The files that it names are those of the job's
             files_id.
@@ -1099,7 +1096,7 @@ def relight(
         integrator: Method: split-sum is fast, as in training, with traced visibility; path is right, by
             paths of light. Default: split-sum.
         samples: Rays or paths per pixel. [default: 4 rays of split-sum, 64 paths]
-        max_bounces: Most surfaces that a path of light meets. Default: 6.
+        max_bounces: Path: most surfaces that a path of light meets. Default: 6.
         rotation_degrees: Turn the light about the vertical by this angle in degrees. Default: 0.0.
         clamp: Cut the light of the environments off at this radiance: fewer bright specks by paths, and
             weaker lamps.
