@@ -5,7 +5,6 @@ from pathlib import Path
 
 import click
 
-from octasplat.engine.core.errors import ConfigError
 from octasplat.workers.cli.main import cli, main
 
 
@@ -58,19 +57,14 @@ def view(source: Path, open_page: bool | None, port: int, background: str) -> No
     with show_progress() as progress:
         scene = read_shown_scene(source, progress)
     # SIGTERM unwinds the program here too, so that the temporary file of the scene is removed.
-    with exit_on_sigterm():
+    with exit_on_sigterm(), serve_scene(scene, source, port=port, background=background) as viewer:
+        click.echo(f"Open {viewer.url} in a browser of this machine (Ctrl-C ends it).")
+        if has_display() if open_page is None else open_page:
+            webbrowser.open(viewer.url)
         try:
-            viewer = serve_scene(scene, source, port=port, background=background)
-        except OSError as error:
-            raise ConfigError(f"--port {port} cannot be used ({error.strerror}); choose another.") from None
-        with viewer:
-            click.echo(f"Open {viewer.url} in a browser of this machine (Ctrl-C ends it).")
-            if has_display() if open_page is None else open_page:
-                webbrowser.open(viewer.url)
-            try:
-                viewer.wait()
-            except KeyboardInterrupt:  # the usual end
-                click.echo()
+            viewer.wait()
+        except KeyboardInterrupt:  # the usual end
+            click.echo()
 
 
 cli.add_command(api)

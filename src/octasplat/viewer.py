@@ -133,7 +133,11 @@ def serve_scene(scene: Scene, path: Path | None, *, port: int, background: str) 
         name = "Scene" if path is None else path.resolve().name
         q = None if run is None else float(Run(run).settings["train"]["trace"]["q"])
         viewed = ViewedScene(name, ply, {"views": []} if run is None else _run_cameras(run), q, background)
-        return Viewer(SceneServer(viewed, port), folder)
+        try:
+            server = SceneServer(viewed, port)
+        except OSError as error:
+            raise ConfigError(f"port {port} cannot be used ({error.strerror}); choose another.") from error
+        return Viewer(server, folder)
     except BaseException:
         folder.cleanup()
         raise
