@@ -119,14 +119,16 @@ def lay_out_scene(paths: Sequence[str]) -> SceneLayout:
     folder = common_folder(rest)
     names = {path: path.removeprefix(folder) for path in rest}
     results = results_folders(names.values())
-    photographs = [name for name in names.values() if is_photograph(name, results)]
+    photographs = {name: None for name in names.values() if is_photograph(name, results)}
     top = next((top for top in (IMAGES, "input/") if any(name.startswith(top) for name in photographs)), "")
+    if not top and is_results_folder(names.values()):
+        photographs = {}
     unused = _unused_model_files(names.values())
     files: dict[str, str] = {}
     for path, name in names.items():
         if name not in unused and file_role(name) in _KEPT_ROLES:
             files[name] = path
-        elif name.startswith(top) and is_photograph(name, results):
+        elif name.startswith(top) and name in photographs:
             files[f"images/{name.removeprefix(top)}"] = path
     taken = set(files.values())
     return SceneLayout(files, tuple(path for path in rest if path not in taken), ignored, folder)
@@ -159,6 +161,11 @@ def results_folders(names: Iterable[str]) -> tuple[str, ...]:
     known = set(names)
     heads = [name.removesuffix("events.jsonl") for name in known if name.endswith("/events.jsonl")]
     return tuple(head for head in heads if f"{head}config.json" in known)
+
+
+def is_results_folder(names: Iterable[str]) -> bool:
+    """Return whether a folder with these files is that of a run, whose renders are no photographs."""
+    return {"config.json", "events.jsonl"} <= set(names)
 
 
 def file_role(name: str) -> FileRole:
@@ -232,7 +239,7 @@ def too_few_photographs(count: int) -> str | None:
 def left_out_sentences(paths: Sequence[str]) -> tuple[str, ...]:
     """Return what to say of files that are left out: how many of each kind, which, and the way out."""
     kinds: dict[str, list[str]] = {}
-    results = results_folders(paths)
+    results = ("",) if is_results_folder(paths) else results_folders(paths)
     for path in paths:
         kind = "results" if path.startswith(results) else _kind_of(path)
         kinds.setdefault(kind, []).append(path)

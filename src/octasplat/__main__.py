@@ -5,7 +5,6 @@ from pathlib import Path
 
 import click
 
-from octasplat.engine.core.errors import ConfigError
 from octasplat.workers.cli.main import cli, main
 
 
@@ -14,7 +13,7 @@ from octasplat.workers.cli.main import cli, main
 def api(ctx: click.Context) -> None:
     """Run the HTTP front end alone, configured by the environment.
 
-    The settings are in octasplat/service/settings.py, each given as OCTASPLAT_NAME. The address goes to
+    docs/service_settings.md lists the settings, each a variable such as OCTASPLAT_NAME. The address goes to
     standard output once requests are taken. On SIGTERM, requests in progress are finished and streams end.
     """
     from octasplat.service.serving import main as serve_api
@@ -58,19 +57,14 @@ def view(source: Path, open_page: bool | None, port: int, background: str) -> No
     with show_progress() as progress:
         scene = read_shown_scene(source, progress)
     # SIGTERM unwinds the program here too, so that the temporary file of the scene is removed.
-    with exit_on_sigterm():
+    with exit_on_sigterm(), serve_scene(scene, source, port=port, background=background) as viewer:
+        click.echo(f"Open {viewer.url} in a browser of this machine (Ctrl-C ends it).")
+        if has_display() if open_page is None else open_page:
+            webbrowser.open(viewer.url)
         try:
-            viewer = serve_scene(scene, source, port=port, background=background)
-        except OSError as error:
-            raise ConfigError(f"--port {port} cannot be used ({error.strerror}); choose another.") from None
-        with viewer:
-            click.echo(f"Open {viewer.url} in a browser of this machine (Ctrl-C ends it).")
-            if has_display() if open_page is None else open_page:
-                webbrowser.open(viewer.url)
-            try:
-                viewer.wait()
-            except KeyboardInterrupt:  # the usual end
-                click.echo()
+            viewer.wait()
+        except KeyboardInterrupt:  # the usual end
+            click.echo()
 
 
 cli.add_command(api)

@@ -51,6 +51,10 @@ FOLDERS = {
     "drone": ((*PHOTOGRAPHS, "gcp_list.txt", "flight.MRK"), PHOTOGRAPHS),
     "masks": ((*PHOTOGRAPHS, "masks/a.jpg.png"), PHOTOGRAPHS),
     "run": ((*PHOTOGRAPHS, "run/config.json", "run/events.jsonl", "run/renders/x.png"), PHOTOGRAPHS),
+    "run around photographs": (
+        ("config.json", "events.jsonl", "renders/x.png", *(f"images/{name}" for name in PHOTOGRAPHS)),
+        PHOTOGRAPHS,
+    ),
     "input": ((*(f"input/{name}" for name in PHOTOGRAPHS), "other/x.jpg"), PHOTOGRAPHS),
     "images without photographs": ((*PHOTOGRAPHS, "images/readme.txt"), PHOTOGRAPHS),
     "scene in a folder": ((*(f"fox/images/{name}" for name in PHOTOGRAPHS), "fox/x.md"), PHOTOGRAPHS),
@@ -314,3 +318,16 @@ def test_only_model_with_another_number_is_kept_in_an_archive() -> None:
     names = [f"sparse/1/{part}.bin" for part in ("cameras", "images", "points3D")]
     data = build_zip(*(ZipMember(name, b"x") for name in ["images/a.jpg", *names]))
     assert {file.name for file in list_archive(io.BytesIO(data)).files} == {"images/a.jpg", *names}
+
+
+def test_renders_of_a_run_are_no_photographs_at_any_door(tmp_path: Path) -> None:
+    paths = ("config.json", "events.jsonl", *(f"renders/{name}" for name in PHOTOGRAPHS))
+    for told in (by_folder(paths), by_folder([f"run/{path}" for path in paths])):
+        assert told.photographs == frozenset()
+        assert told.refusals[0].startswith("There are 0 photographs")
+        assert told.notes[0].startswith("5 files of results among the photographs are left out")
+    with pytest.raises(IntakeError, match="no part of a scene"):
+        list_archive(io.BytesIO(build_zip(*(ZipMember(path, b"x") for path in paths))))
+    write_files(tmp_path, paths)
+    with pytest.raises(DatasetError, match="is the folder of a run"):
+        locate_scene(tmp_path)

@@ -73,7 +73,7 @@ def test_view_names_a_taken_port(scene: osp.Scene, tmp_path: Path) -> None:
         port = str(other.getsockname()[1])
         command = [sys.executable, "-m", "octasplat", "view", str(tmp_path / "scene.ply"), "--port", port]
         done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 1 and f"--port {port} cannot be used" in done.stderr
+    assert done.returncode == 1 and f"Error: port {port} cannot be used" in done.stderr
 
 
 @pytest.mark.tools
