@@ -6,10 +6,12 @@ have no rows. No operation lists fields, so that none can forget one.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import Field, fields, replace
+from pathlib import Path
 from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
+from octasplat.engine.core.file_arrays import new_array
 from octasplat.engine.gaussians.channels import Channels
 
 RowIndex = np.ndarray | slice
@@ -67,9 +69,9 @@ def select_rows(table: TableT, index: RowIndex) -> TableT:
     return map_rows(table, lambda array: array[index].copy())
 
 
-def allocate_rows(table: TableT, count: int) -> TableT:
-    """Return a table with the columns of another and so many rows, not filled yet."""
-    return map_rows(table, lambda array: np.empty((count, *array.shape[1:]), array.dtype))
+def allocate_rows(table: TableT, count: int, folder: Path | None = None) -> TableT:
+    """Return a table with the columns of another and so many rows, not filled yet; with a folder in files."""
+    return map_rows(table, lambda array: new_array((count, *array.shape[1:]), array.dtype, folder))
 
 
 def view_rows(table: TableT, part: slice) -> TableT:
