@@ -63,7 +63,7 @@ def finish_scene(work: BlockWork, plan: ScenePlan, tell: PieceProgress) -> Block
         CancelledError: stopped as asked.
     """
     coarse = load_best(work.folder / COARSE)
-    merged, is_near_cut = merge_cores(work, plan, coarse)
+    merged, is_near_cut = merge_cores(work.folder, work.config, plan, coarse)
     if plan.is_finished_together:
         finished = _finish(work, plan, merged, coarse, tell)
     else:

@@ -2,28 +2,31 @@
 
 from collections.abc import Sequence
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool
 
-from octasplat.engine.blocks.piece_training import BlockWork
-from octasplat.engine.blocks.scene_plan import ScenePlan, block_name
+from octasplat.engine.blocks.block_plan import Block
+from octasplat.engine.blocks.scene_plan import ScenePlan
 from octasplat.engine.gaussians.merge import with_sh_degree
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.rows import allocate_rows
 from octasplat.engine.gaussians.simplification import simplify
+from octasplat.engine.train.config import TrainConfig
 from octasplat.engine.train.loop.checkpoint import BestState, load_best
 
 
 def merge_cores(
-    work: BlockWork, plan: ScenePlan, coarse: BestState
+    folder: Path, config: TrainConfig, plan: ScenePlan, coarse: BestState
 ) -> tuple[FlatGaussians, Bool[np.ndarray, " n"]]:
     """Return the Gaussians of all cores, block after block, and which of them are near to cuts.
 
-    The Gaussians are in files without a name in the folder of the pieces.
+    The Gaussians are in files without a name.
 
     Args:
-        work: settings and the folder with all blocks.
+        folder: of the pieces, with all blocks; the files without a name are there, too.
+        config: of the run.
         plan: of the scene.
         coarse: the coarse scene.
 
@@ -31,15 +34,19 @@ def merge_cores(
         CheckpointError: a block is missing or damaged.
         DiskFullError: there is no room for the files.
     """
-    numbers = range(1, len(plan.blocks) + 1)
-    found = [len(_core_of_block(work, plan, number, coarse)) for number in numbers]
-    counts = limited_counts(found, work.config.max_gaussians)
+
+    def core_of(name: str, block: Block) -> FlatGaussians:
+        """Return the Gaussians of a core; those of the coarse scene where few views show it."""
+        found = (load_best(folder / name) if block.is_trained else coarse).gaussians
+        return with_sh_degree(found.select(block.core.contains(found.means_world)), config.sh_degree)
+
+    blocks = list(zip(plan.block_names, plan.blocks, strict=True))
+    counts = limited_counts([len(core_of(*block)) for block in blocks], config.max_gaussians)
     ends = np.cumsum([0, *counts]).tolist()
-    merged = allocate_rows(with_sh_degree(coarse.gaussians, work.config.sh_degree), ends[-1], work.folder)
+    merged = allocate_rows(with_sh_degree(coarse.gaussians, config.sh_degree), ends[-1], folder)
     is_near_cut = np.empty(ends[-1], np.bool_)
-    for number, (start, end) in zip(numbers, pairwise(ends), strict=True):
-        block = plan.blocks[number - 1]
-        core = simplify(_core_of_block(work, plan, number, coarse), end - start, folder=work.folder)
+    for (name, block), (start, end) in zip(blocks, pairwise(ends), strict=True):
+        core = simplify(core_of(name, block), end - start, folder=folder)
         merged.put(slice(start, end), core)
         inner = block.core.grown(-block.margin_world)
         is_near_cut[start:end] = ~inner.contains(core.means_world)
@@ -64,11 +71,3 @@ def limited_counts(counts: Sequence[int], most: int) -> list[int]:
         return list(counts)
     shares = np.diff(ends * most // ends[-1], prepend=0).tolist()
     return [min(count, max(1, share)) for count, share in zip(counts, shares, strict=True)]
-
-
-def _core_of_block(work: BlockWork, plan: ScenePlan, number: int, coarse: BestState) -> FlatGaussians:
-    """Return the Gaussians of a block's core; those of the coarse scene where few views show it."""
-    block = plan.blocks[number - 1]
-    found = load_best(work.folder / block_name(number)) if block.is_trained else coarse
-    core = found.gaussians.select(block.core.contains(found.gaussians.means_world))
-    return with_sh_degree(core, work.config.sh_degree)

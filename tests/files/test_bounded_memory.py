@@ -27,6 +27,7 @@ WRITTEN = {
     "a.compressed.ply": ORDER_BYTES,
     "a.glb": ORDER_BYTES + 12,  # a 64th of them at a time
     "a.mesh.ply": 9,  # which have an octagon
+    "tiles/tileset.json": 60,  # the tree of neighbors, and who is the partner of whom; levels are in files
 }
 READ = {
     "a.ply": 1,  # whether each is valid
