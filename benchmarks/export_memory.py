@@ -109,11 +109,17 @@ def anonymous_bytes(pid: int) -> int:
 
 
 def children_of(pid: int) -> list[int]:
-    """Ids of the processes that a process has started."""
+    """Return the ids of the programs that a process has started."""
     try:
-        return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+        children = [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+        # until it is another program it shares the memory of the one that starts it
+        return [child for child in children if _command_of(child) != _command_of(pid)]
     except OSError:
         return []
+
+
+def _command_of(pid: int) -> bytes:
+    return Path(f"/proc/{pid}/cmdline").read_bytes()
 
 
 def measure(action: str, name: str, path: Path, count: int, sh_degree: int) -> tuple[float, int, int]:
