@@ -10,11 +10,13 @@ import argparse
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
 import click
 
+from benchmarks.marked_parts import with_part
 from octasplat.__main__ import cli
 from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.cost_model import estimate_reconstruction
@@ -29,8 +31,6 @@ from octasplat.workers.settings import PREFIX, WorkerSettings
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 WRITTEN_BY = "This page is written by `python -m benchmarks.reference --write`."
 ESTIMATES_PAGE = "time_and_memory.md"
-BEGIN = "<!-- estimates: by python -m benchmarks.reference --write -->"
-END = "<!-- end of estimates -->"
 MEGAPIXELS = ((1_600, 1_200), (4_000, 3_000), (6_000, 4_000))
 COUNTS = (20, 50, 100, 200, 500)
 PRESETS = ("fast", "standard", "high")
@@ -45,8 +45,10 @@ def commands_page() -> str:
         "# Commands",
         "",
         f"{WRITTEN_BY} `octasplat COMMAND --help` shows the same in the terminal. Every command ends with "
-        "status 0 where it did what was asked, 1 with one sentence where it could not, and 2 where its "
-        "options are wrong.",
+        "status 0 where it did what was asked, 1 with one sentence where it could not or cannot use a "
+        "value, 2 where options are unknown, missing, out of range or do not go together, 130 or 143 where "
+        "Ctrl-C or SIGTERM stopped it before its end, and 70 where something went wrong that nobody "
+        "expected.",
         "",
     ]
     for context in _commands(click.Context(cli, info_name="octasplat")):
@@ -76,9 +78,14 @@ def http_page() -> str:
         f"{WRITTEN_BY} A service shows the same at `/docs` and as OpenAPI 3.1 at `/openapi.json`. "
         "[HTTP by example](service.md) has examples.",
         "",
+        "A GET and `POST /v1/estimates` need a token with the scope `read`, every other request one with "
+        "`write`, unless its text says otherwise ([rights of tokens](service.md#rights-of-tokens)); "
+        "`/healthz` and `/readyz` need none.",
+        "",
         "Every request may also be answered by 400 (malformed), 401 (no valid token), 403 (the token's scope "
         "does not suffice), 421 (a foreign host name), 422 (refused, with the reasons under `errors`), "
-        "429 (too many requests, or wrong tokens) or 503 (try again later).",
+        "429 (too many requests, or wrong tokens) or 503 (try again later), and one with a body by 413 (too "
+        "long).",
         "",
     ]
     for group in operation_groups(document):
@@ -117,11 +124,8 @@ def service_settings_page() -> str:
 def estimates_page() -> str:
     """Return ``docs/time_and_memory.md`` with its table made anew."""
     text = (DOCS / ESTIMATES_PAGE).read_text(encoding="utf-8")
-    before, found, rest = text.partition(BEGIN)
-    _, closed, after = rest.partition(END)
-    if not found or not closed:
-        raise SystemExit(f"docs/{ESTIMATES_PAGE} has no part between '{BEGIN}' and '{END}'.")
-    return f"{before}{BEGIN}\n\n{estimates_table()}\n\n{END}{after}"
+    program = "benchmarks.reference --write"
+    return with_part(text, "estimates", program, estimates_table(), page=f"docs/{ESTIMATES_PAGE}")
 
 
 def estimates_table() -> str:
@@ -186,12 +190,18 @@ def _request_rows(document: Mapping[str, Any], operation: ApiOperation) -> list[
         schemas = list(_objects(document, content.get("schema", {})))
         if not schemas:
             rows.append(f"| | body | `{media_type}` | |")
+        told: dict[tuple[str, str, str], list[str]] = {}
         for title, schema in schemas:
             for name, field in schema.get("properties", {}).items():
-                where = f"body of {title}" if len(schemas) > 1 else "body"
                 needed = ", needed" if name in schema.get("required", ()) else ""
                 kind = _cell(_type(document, field)) + needed
-                rows.append(f"| `{name}` | {where} | {kind} | {_cell(field.get('description', ''))} |")
+                told.setdefault((name, kind, _cell(field.get("description", ""))), []).append(title)
+        # What all choices have is told once, before what they differ in.
+        for (name, kind, text), titles in sorted(
+            told.items(), key=lambda entry: len(entry[1]) < len(schemas)
+        ):
+            where = "body" if len(titles) == len(schemas) else f"body of {', '.join(titles)}"
+            rows.append(f"| `{name}` | {where} | {kind} | {text} |")
     return ["| Name | Where | Type | What it is |", "|---|---|---|---|", *rows, ""] if rows else []
 
 
@@ -260,7 +270,9 @@ def _code(text: str) -> str:
 
 
 def _cell(text: str) -> str:
-    return " ".join(text.split()).replace("|", "\\|").replace("<", "&lt;")
+    """Return a text for a cell of a table; what is code already shows ``<`` as it is."""
+    parts = " ".join(text.split()).replace("|", "\\|").split("`")
+    return "`".join(part if odd else part.replace("<", "&lt;") for part, odd in zip(parts, cycle((0, 1))))
 
 
 def stale_pages() -> list[str]:

@@ -19,6 +19,8 @@ from pathlib import Path
 import grimp
 import networkx as nx
 
+from benchmarks.marked_parts import with_part
+
 PACKAGES = ("engine", "workers", "service")
 EVERYBODY = frozenset({"core"})
 """What any other may use; it would hide the rest of the drawing."""
@@ -97,12 +99,7 @@ def written_page(root: Path, graph: grimp.ImportGraph) -> str:
     """Text of docs/architecture.md, its marked parts made anew."""
     text = (root / PAGE).read_text(encoding="utf-8")
     for name, part in (("folders", folders(root)), ("drawing", drawing(graph))):
-        begin, end = f"<!-- {name}: by python -m benchmarks.structure --write -->", f"<!-- end of {name} -->"
-        before, found, rest = text.partition(begin)
-        _, closed, after = rest.partition(end)
-        if not found or not closed:
-            raise SystemExit(f"{PAGE} has no part between '{begin}' and '{end}'.")
-        text = f"{before}{begin}\n\n{part}\n\n{end}{after}"
+        text = with_part(text, name, "benchmarks.structure --write", part, page=PAGE.as_posix())
     return text
 
 

@@ -29,7 +29,7 @@ PHASE_TITLES = {
     "depth": "Rendering depth",
     "fusing": "Fusing depth",
     "meshing": "Meshing",
-    "settling": "Settling",
+    "settling": "Moving the vertices",
     "decimating": "Decimating",
     "unwrapping": "Unwrapping",
     "coloring": "Coloring",

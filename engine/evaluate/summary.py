@@ -29,8 +29,8 @@ _TRUTH = (
 )
 
 
-def format_mean_metrics(metrics: dict[str, Any]) -> str:
-    """Return a line on the held-out views from the content of ``metrics.json``."""
+def format_mean_metrics(metrics: dict[str, Any], noun: str = "held-out view") -> str:
+    """Return a line on the views from the content of ``metrics.json``; ``noun`` is what each of them is."""
     count = len(metrics["views"])
     if count == 0:
         return "No views were held out, so nothing was measured."
@@ -38,7 +38,7 @@ def format_mean_metrics(metrics: dict[str, Any]) -> str:
     known = [form.format(mean[key]) for key, form in _METRICS if mean.get(key) is not None]
     left_out = metrics.get("mean_left_out", {}).get("psnr", 0)
     without = f" ({left_out} perfect or wholly masked left out)" if left_out else ""
-    return f"Mean over {count} held-out view{'s' if count > 1 else ''}{without}: {', '.join(known)}"
+    return f"Mean over {count} {noun}{'s' if count > 1 else ''}{without}: {', '.join(known)}"
 
 
 def summarize_evaluation(path: Path) -> list[str]:
@@ -47,7 +47,7 @@ def summarize_evaluation(path: Path) -> list[str]:
     known = metrics.get("truth", {}).get("mean", {})
     truth_figures = [form.format(known[key]) for key, form in _TRUTH if known.get(key) is not None]
     return [
-        format_mean_metrics(metrics),
+        format_mean_metrics(metrics, "view"),  # which may have been trained on
         *([f"Against the truth: {', '.join(truth_figures)}"] if truth_figures else []),
         f"{'Report:':8}{path.with_name('report.html')}",
     ]

@@ -6,8 +6,9 @@ Two forms are read, told apart by their content:
 ``x y z px py photograph name``, apart by blanks or tabs.
 
 A CSV with a line of names: ``name,x,y,z,photograph,px,py``, a row for each sighting; a comment
-``# EPSG:32632`` says the coordinate system. A row without a photograph is one of a photograph (its camera's
-position) or of a sparse point (its number), by ``name``. Points without ``x,y,z`` are for known lengths.
+``# EPSG:32632`` or ``# WGS84 UTM 32N`` says the coordinate system. A row without a photograph is one of a
+photograph (its camera's position) or of a sparse point (its number), by ``name``. Points without ``x,y,z``
+are for known lengths.
 """
 
 import csv
@@ -27,6 +28,9 @@ MAX_BYTES = 10_000_000
 _COLUMNS = {"image": "photograph", "im_x": "px", "im_y": "py", "label": "name", "gcp_name": "name"}
 _PROJECTED_AMONG_DEGREES = frozenset((*range(4491, 4555), 4647))
 """EPSG codes of projected systems in metres, of CGCS2000 and of Germany, among those that give degrees."""
+_EPSG = re.compile(r"EPSG", re.IGNORECASE)
+_OTHER_SYSTEM = re.compile(r"\bUTM\b|\+proj|\bWGS ?84\b", re.IGNORECASE)
+"""What a comment has that says a coordinate system, known or not."""
 _UTM = re.compile(r"WGS ?84 UTM ?(?:zone )?([0-9]{1,2}) ?([NS])", re.IGNORECASE)
 _PROJ_UTM = re.compile(r"\+proj=utm .*\+zone=([0-9]{1,2})", re.IGNORECASE)
 
@@ -90,15 +94,18 @@ def read_control_file(path: Path) -> ControlFile:
             raise ConfigError(f"{path} has more than {MAX_BYTES / 1e6:.0f} MB; control points take less.")
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
         raise ConfigError(
-            f"{path} cannot be read as text ({error}); name a file of control points."
+            f"{path} cannot be read as text ({reason}); name a file of control points."
         ) from None
     numbered = [(number, line.strip()) for number, line in enumerate(lines, 1) if line.strip()]
     content = [(number, line) for number, line in numbered if not line.startswith("#")]
     is_csv = bool(content) and "," in content[0][1] and "name" in _csv_names(content[0][1])
     if is_csv:
-        comments = [line for _, line in numbered if line.startswith("#")]
-        stated = next((line.lstrip("# ") for line in comments if "EPSG" in line.upper()), "")
+        comments = [line.lstrip("# ") for _, line in numbered if line.startswith("#")]
+        # a number comes first; any other system is read or refused, so that its points are not taken as local
+        found = [line for pattern in (_EPSG, _OTHER_SYSTEM) for line in comments if pattern.search(line)]
+        stated = next(iter(found), "")
         rows = _csv_rows(path, content)
     else:
         stated = content[0][1] if content else ""

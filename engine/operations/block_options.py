@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import ByteSize, Field, TypeAdapter, ValidationError
+from pydantic import BeforeValidator, ByteSize, Field, TypeAdapter, ValidationError
 
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.dataset.image_sizes import ImageSizes
@@ -19,10 +19,32 @@ MIN_GAUSSIANS = 5_000
 """Fewer in a block are not worth one."""
 
 
+MAX_BLOCKS = 10_000
+"""As many as may be asked for."""
+_Count = Annotated[int, Field(ge=1, le=MAX_BLOCKS)] | Literal["auto"] | None
+
+
+def _read_count(value: object) -> object:
+    """Return the number of blocks, ``auto`` or None.
+
+    Raises:
+        ValueError: the value is none of them.
+    """
+    if value is None or value == "auto":
+        return value
+    try:
+        count = TypeAdapter(int).validate_python(value)
+    except ValidationError:
+        count = 0
+    if not 1 <= count <= MAX_BLOCKS:
+        raise ValueError(f"{value!r} is neither auto nor a number of blocks from 1 to {MAX_BLOCKS:,}")
+    return count
+
+
 class BlockOptions(Options):
     """How a scene is cut into blocks."""
 
-    blocks: Annotated[int, Field(ge=1, le=10_000)] | Literal["auto"] | None = Field(
+    blocks: Annotated[_Count, BeforeValidator(_read_count, json_schema_input_type=_Count)] = Field(
         None,
         description="Train the scene in so many blocks, one after the other or, as a job of a service, on "
         "all workers at once; auto takes the fewest that the number of photographs and the memory ask for, "

@@ -16,6 +16,7 @@ from octasplat.engine.operations.base import (
     Options,
     ScenesWritten,
     SourceRequest,
+    emit_warning,
     never_stop,
     options_of,
     stop_if,
@@ -91,7 +92,11 @@ def run(
     if request.output is not None:
         scene_io.check_edited_output("clean", request, request.output)
     gaussians = scene_io.open_scene(source, progress)
-    share = request.camera_clearance  # a file has neither cameras nor sparse points
+    if not is_run(source):  # a file has neither cameras nor sparse points
+        for name in ("camera_clearance", "min_views"):
+            if getattr(request, name) not in (0, CleanOptions.model_fields[name].default):
+                emit_warning(progress, f"{source}: {name} goes with the folder of a run and is passed over.")
+    share = request.camera_clearance
     zones = run_camera_clearance(source, share) if share > 0 and is_run(source) else None
     seen = run_seen_test(source, request.min_views) if request.min_views > 0 and is_run(source) else None
     keep, report = clean(gaussians, request, zones, seen)

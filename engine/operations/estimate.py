@@ -31,7 +31,8 @@ class EstimateOptions(PlainReconstructOptions):
 class EstimateRequest(EstimateOptions, Request):
     """Estimate the time, memory and disk that the reconstruction of SCENE takes, within a factor of two.
 
-    The options are those of reconstruct. Photographs are not decoded: their sizes are enough.
+    The options are those of reconstruct; for blocks octasplat plan has them. Photographs are not decoded:
+    their sizes are enough.
     """
 
     source: Annotated[Path, Positional("SCENE"), ReadPath()] = Field(

@@ -49,9 +49,10 @@ class ImportOptions(Options):
 class ImportRequest(ImportOptions, WritingRequest):
     """Read IN, a scene of Gaussians in any known format, and write OUT.ply in the layout of 3DGS.
 
-    Formats: 3DGS PLY, compressed PLY (PlayCanvas, SuperSplat), .splat, .spz, .sog or the folder of one, and
-    .glb with KHR_gaussian_splatting. A Gaussian with three extents loses the smallest; what that means for
-    the scene is told. All other commands read the same formats.
+    Formats: 3DGS PLY, compressed PLY (PlayCanvas, SuperSplat), .splat, .spz, .sog or the folder of one, .glb
+    with KHR_gaussian_splatting, and octagon meshes (.glb, .ply) as they were exported. A Gaussian with three
+    extents loses the smallest; what that means for the scene is told. All other commands read the same
+    formats.
     """
 
     output: Annotated[Path, Positional("OUT.ply")] = Field(description="The scene to write.")

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from pydantic import Field, InstanceOf
+from pydantic import Field, InstanceOf, field_validator
 
 from octasplat.engine.core.events import EventListener, ignore_events
 from octasplat.engine.core.georeference import Georeference
@@ -57,6 +57,13 @@ class InfoRequest(InfoOptions, WritingRequest):
     output: Annotated[Path | None, Spelling(("-o", "--output"), metavar="FILE.json")] = Field(
         None, description="Write everything as JSON, too."
     )
+
+    @field_validator("picture")
+    @classmethod
+    def _check_picture(cls, picture: Path | None) -> Path | None:
+        if picture is not None and picture.suffix.lower() != ".png":
+            raise ValueError(f"{picture} is no name of a .png, which is what is written")
+        return picture
 
 
 class InfoResult(Result):

@@ -49,7 +49,7 @@ class RelightOptions(PictureOptions):
         description=f"Rays or paths per pixel.  [default: {SPLIT_SUM_RAYS} rays of split-sum, {PATHS} paths]",
     )
     max_bounces: Annotated[int, Unit("surfaces")] = Field(
-        6, ge=1, le=64, description="Most surfaces that a path of light meets."
+        6, ge=1, le=64, description="Path: most surfaces that a path of light meets."
     )
     rotation_degrees: Annotated[Angle, Unit("degrees"), Spelling(("--rotate",), metavar="DEG")] = Field(
         0.0, description="Turn the light about the vertical by this angle in degrees."
@@ -90,6 +90,11 @@ class RelightOptions(PictureOptions):
     def unused(self) -> tuple[str, ...]:
         """Return a sentence about given options that have no effect on such images."""
         sentences = super().unused()
+        most = type(self).model_fields["max_bounces"].default
+        if self.integrator == "split-sum" and self.max_bounces != most:
+            sentences += (
+                "The number of surfaces (max_bounces) goes with the integrator path and is passed over.",
+            )
         # a square grid of rays
         if self.integrator == "split-sum" and self.rays_across**2 != self.samples_per_pixel:
             sentences += (

@@ -48,8 +48,8 @@ class RenderOptions(PictureOptions):
 
     background: Literal["black", "white", "transparent"] | None = Field(
         None,
-        description="Behind the scene; transparent gives images alpha.  [default: that of the run's "
-        "evaluation, or black]",
+        description="Behind the scene; transparent gives images alpha.  [default: what the run has learnt, "
+        "or that of its evaluation; of a file black]",
     )
     stage: Annotated[
         Stage | None,

@@ -8,7 +8,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.operations.axes import Axis
 from octasplat.engine.operations.base import Options, WritingRequest
-from octasplat.engine.render.file_names import IMAGE_SUFFIXES, has_number_pattern
+from octasplat.engine.render.file_names import IMAGE_SUFFIXES, UNWRITTEN_SUFFIXES, has_number_pattern
 from octasplat.engine.render.path_document import (
     MAX_FRAMES,
     PathDocument,
@@ -267,6 +267,11 @@ class PictureRequest(PictureOptions, WritingRequest):
     @model_validator(mode="after")
     def _output_fits(self) -> "PictureRequest":
         suffix = self.output.suffix.lower()
+        if suffix in UNWRITTEN_SUFFIXES:
+            raise ValueError(
+                f"{self.output}: images are written as .png or .exr and films as .mp4; name one of these, or "
+                "a folder"
+            )
         if (suffix == ".mp4") != (self.format == "mp4"):
             if suffix == ".mp4":
                 raise ValueError("EXR and PNG are images; name a folder or an image instead of a video")

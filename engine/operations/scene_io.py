@@ -25,7 +25,7 @@ from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.scene_metadata import SceneMetadata
 from octasplat.engine.operations.base import SourceRequest
 from octasplat.engine.operations.written_files import check_targets
-from octasplat.engine.runs.run_folder import is_run, unexported_parts
+from octasplat.engine.runs.run_folder import CONFIG, is_run, unexported_parts
 from octasplat.engine.settings.fields import map_named_files
 
 MAX_ROUNDING = 0.01
@@ -227,7 +227,8 @@ def write_edited_scene(
     for warning in write_edited_run(source, gaussians, output, edit_record, facts=facts, matrix=matrix):
         progress(Warned(warning))
     files = tuple(sorted(path for path in output.rglob("*") if path.is_file()))
-    sentence = f"Wrote {output}: a run with {len(gaussians):,} Gaussians."
+    what = "a run" if (output / CONFIG).exists() else "a scene"  # what was sheared has no cameras any more
+    sentence = f"Wrote {output}: {what} with {len(gaussians):,} Gaussians."
     return WrittenScene(files, sentence, folder=output)
 
 

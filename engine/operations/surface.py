@@ -83,8 +83,8 @@ class SurfaceOptions(ExtractionOptions, Options):
 
     room: bool = Field(
         False,
-        description="What pictures of a room need, where nothing else is said: unbounded, unseen solid, "
-        "backdrop, settle and finer voxels.",
+        description="What pictures of a room need, where nothing else is said: unbounded (not with bounds), "
+        "unseen solid, backdrop, refine_vertices, and finer voxels than a box has.",
     )
     max_triangles: Annotated[
         tuple[str, ...],
@@ -111,7 +111,9 @@ class SurfaceOptions(ExtractionOptions, Options):
         if not isinstance(given, Mapping):
             return given
         given = renamed_settings.replace_former_names((cls,), given)
-        room = ROOM_DEFAULTS if _is_on(given.get("room", False)) else {}
+        room = dict(ROOM_DEFAULTS) if _is_on(given.get("room", False)) else {}
+        if given.get("bounds") is not None:
+            room.pop("unbounded", None)  # a box says that there are bounds
         materials = MATERIAL_DEFAULTS if _is_on(given.get("materials", False)) else {}
         return {**room, **materials, **given}  # what is given wins over both presets
 

@@ -66,9 +66,11 @@ def check_targets(
             raise OutputError(f"{target} is a folder; name a file.")
         above = next((folder for folder in target.parents if folder.exists()), None)
         if above is not None and not above.is_dir():
-            raise OutputError(f"{target} cannot be written, as {above} is a file; choose another -o.")
+            raise OutputError(f"{target} cannot be written, as {above} is a file; choose another place.")
         if (folder := read.place_of(target)) is not None:
-            raise ConfigError(f"{target}: would overwrite what the command reads{folder}; choose another -o.")
+            raise ConfigError(
+                f"{target}: would overwrite what the command reads{folder}; choose another name."
+            )
     there = [target for target in checked if target.exists()]
     if overwrite or not there:
         return

@@ -23,6 +23,7 @@ from octasplat.engine.pipeline.run import ReconstructionRun
 from octasplat.engine.pipeline.start_scene import has_start, started_state
 from octasplat.engine.render.environment_files import write_background_map, write_environment
 from octasplat.engine.render.shots import training_pixel_angle
+from octasplat.engine.runs.config import resolve_config
 from octasplat.engine.runs.run_folder import (
     BACKGROUND,
     CHECKPOINTS,
@@ -277,6 +278,9 @@ def _plan_settings(run: ReconstructionRun, clock: PhaseClock) -> TrainConfig:
     if settings.minutes is None:
         return config
     if not (output / PLAN).exists():
+        of_preset = resolve_config(settings.preset, materials=config.materials.learn).train
+        if config.iterations != of_preset.iterations:
+            run.progress(Warned(f"iterations={config.iterations} is passed over, as minutes decides them."))
         began = clock.seconds()
         first = _first_state(run, config).gaussians
         now = clock.seconds()

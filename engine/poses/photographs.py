@@ -17,13 +17,14 @@ from octasplat.engine.core.scene_layout import (
 )
 from octasplat.engine.dataset.model_sources import has_model
 from octasplat.engine.dataset.photograph_files import image_folder
+from octasplat.engine.dataset.results_among import is_run_folder
 
 
 def locate_scene(folder: Path) -> Path:
     """Return the scene that ``folder`` is, or the one below it where there is nothing beside that.
 
     Raises:
-        DatasetError: it is no folder.
+        DatasetError: it is no folder, or that of a run.
     """
     _check_folder(folder)
     inner = folder / _layout_of(folder).folder
@@ -37,7 +38,8 @@ def photographs_of_scene(scene: Path) -> list[str]:
     beside photographs, as ``a_mask.png`` of ``a.jpg``.
 
     Raises:
-        DatasetError: it is no folder, or there are fewer than three; the text names what is left out.
+        DatasetError: it is no folder, or that of a run, or there are fewer than three; the text names what is
+            left out.
     """
     _check_folder(scene)
     layout, folder = _layout_of(scene), image_folder(scene)
@@ -61,6 +63,10 @@ def notes_on_files(scene: Path) -> tuple[str, ...]:
 def _check_folder(scene: Path) -> None:
     if not scene.is_dir():
         raise DatasetError(f"{scene} is not a folder; name the folder that holds the photographs.")
+    if is_run_folder(scene) and image_folder(scene) == scene:  # its renders would be taken for photographs
+        raise DatasetError(
+            f"{scene} is the folder of a run; name the folder that holds the photographs it was made of."
+        )
 
 
 def _layout_of(scene: Path) -> SceneLayout:

@@ -6,6 +6,11 @@ from pathlib import Path
 
 IMAGE_SUFFIXES = (".png", ".exr")
 """Of names that mean images; other names mean a folder, or a film."""
+UNWRITTEN_SUFFIXES = frozenset(
+    {".jpg", ".jpeg", ".webp", ".gif", ".tif", ".tiff", ".bmp", ".hdr", ".avif", ".jxl"}
+    | {".mov", ".m4v", ".mkv", ".avi", ".webm", ".mpg", ".mpeg", ".apng"}
+)
+"""Of names that mean images or films in formats that are not written, and surely no folder."""
 
 
 def unique_render_names(photographs: Sequence[str]) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float64
 
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.rays import ImageRays
 
 
@@ -75,13 +76,15 @@ class PinholeCamera:
         """Return a camera that looks at a point and holds ``up_world`` upright in its image.
 
         Raises:
-            ConfigError: it stands in its target, or looks along the up direction.
+            ConfigError: it stands in its target, looks along the up direction, or is no camera by its size or
+                its field of view.
 
         >>> PinholeCamera.looking_at((0, 0, -4), (0, 0, 0), 96, 64).centre_world
         array([ 0.,  0., -4.])
         """
         from octasplat.engine.render.pose_paths import look_at
 
+        check_lens(width_px, height_px, fov_y_degrees)
         position, target, up = (
             np.array(vector, np.float64) for vector in (position_world, target_world, up_world)
         )
@@ -120,6 +123,18 @@ class PinholeCamera:
         depth = np.where(points_cam[:, 2] > 0, points_cam[:, 2], np.nan)
         across = self.fx_px * points_cam[:, 0] / depth + self.cx_px
         return np.stack([across, self.fy_px * points_cam[:, 1] / depth + self.cy_px], axis=-1)
+
+
+def check_lens(width_px: int, height_px: int, fov_y_degrees: float) -> None:
+    """Refuse what is no size of an image or no field of view of a pinhole.
+
+    Raises:
+        ConfigError: the image has no pixels, or the angle is not between 0 and 180 degrees.
+    """
+    if min(width_px, height_px) < 1:
+        raise ConfigError(f"An image of {width_px} x {height_px} pixels has none; both must be at least 1.")
+    if not 0 < fov_y_degrees < 180:
+        raise ConfigError(f"A field of view lies between 0 and 180 degrees; it was given {fov_y_degrees:g}.")
 
 
 def focal_from_fov(fov_degrees: float, side_px: int) -> float:

@@ -33,7 +33,9 @@ class ReconstructionConfig(RunSettings):
 
     train: TrainConfig = Field(TrainConfig(), description="The settings of the training.")
     evaluation_background: Annotated[Literal["black", "white"], ADVANCED] = Field(
-        "black", description="What lies behind renders and photographs with alpha when they are compared."
+        "black",
+        description="What lies behind renders and photographs with alpha when they are compared; by default "
+        "that of the training: white where background is white, else black.",
     )
 
     @model_validator(mode="before")
@@ -200,8 +202,9 @@ def read_config(path: Path) -> ReconstructionConfig:
     except InvalidSettingsError as error:  # not told as damage: the file is of another version
         raise ConfigError(f"{path} is not a configuration of this version: {error}") from None
     except (OSError, ValueError, KeyError, TypeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
         raise ConfigError(
-            f"{path} cannot be read ({error}); name the folder of a finished or stopped run."
+            f"{path} cannot be read ({reason}); name the folder of a finished or stopped run."
         ) from None
 
 

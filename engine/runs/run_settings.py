@@ -78,7 +78,7 @@ class RunSettings(BaseModel):
     evaluation_background: Annotated[Literal["black", "white"] | None, ADVANCED] = Field(
         None,
         description="What lies behind renders and photographs with alpha when they are compared; by default "
-        "that of the training: white where train.background is white, else black.",
+        "that of the training: white where background is white, else black.",
     )
     georeference: Annotated[Literal["auto", "gps", "off"], BASIC] = Field(
         "auto",

@@ -2,7 +2,7 @@
 
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from octasplat.engine.settings import renamed_settings
 from octasplat.engine.settings.base import FormerSetting, Settings
@@ -211,6 +211,20 @@ class MaterialSettings(Settings):
     normal_propagation: Annotated[bool, EXPERIMENTAL] = Field(
         False, description="Hand normals on to neighbours now and then, those of what reflects best first."
     )
+
+    @field_validator("up_world")
+    @classmethod
+    def _has_a_length(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
+        if not any(value):
+            raise ValueError("must be a direction, of which one number at least is not 0")
+        return value
+
+    @field_validator("reflection_ray_slope")
+    @classmethod
+    def _is_positive(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if min(value) <= 0:  # one passes into the other by a constant factor
+            raise ValueError("must be two numbers of more than 0")
+        return value
 
     former_settings: ClassVar = {
         "secondary_share": FormerSetting(1),

@@ -118,7 +118,7 @@ class ExtractionOptions(BaseModel):
         Unit("voxels"),
         Spelling(metavar="VOXELS"),
         BeforeValidator(_read_rim, json_schema_input_type=Literal["all"] | float),
-    ] = Field(0.0, description="Close holes with rims shorter than so many voxels; or 'all'.")
+    ] = Field(0.0, description="Close holes whose rim is no longer than so many voxels; or 'all'.")
     fit: Annotated[bool, Group("advanced")] = Field(
         True,
         description="Of all colors, take those with which the mesh looks as like the pictures as it can.",
@@ -127,7 +127,8 @@ class ExtractionOptions(BaseModel):
         None,
         ge=64,
         le=16384,
-        description="Colors in a square texture of this side instead of in the vertices; .glb and .obj.",
+        description="Colors in a square texture of this side instead of in the vertices; .glb, .obj and "
+        ".usdz.",
     )
     max_memory_gb: Annotated[float, Unit("GB"), Spelling(("--max-memory",), metavar="GB")] = Field(
         4.0, gt=0, description="Refuse a volume that takes more memory than this."

@@ -249,6 +249,10 @@ def path_of_views(content):
     frames = []
     for view in content["views"]:
         camera = content["cameras"][view["camera"]]
+        if camera["model"] == "EQUIRECTANGULAR":
+            raise SystemExit(
+                f"{view['name']}: is a panorama, which Blender's cameras do not show; leave them out."
+            )
         single = camera["model"].startswith(("SIMPLE_", "RADIAL"))
         fx, fy, cx, cy = [camera["params"][0], *camera["params"][:3]] if single else camera["params"][:4]
         across, down = width / camera["width_px"], height / camera["height_px"]

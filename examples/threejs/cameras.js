@@ -3,9 +3,10 @@ import { Matrix4, PerspectiveCamera } from "three";
 
 const TURN = new Matrix4().makeScale(1, -1, -1);
 
-// One frame of a camera path, the JSON file that `octasplat render --path` takes.
+// One frame, or one key, of a camera path, the JSON file that `octasplat render --path` takes.
 export function cameraOfFrame(path, number, near = 0.01, far = 1000) {
-  const frame = path.frames[number];
+  const frame = (path.frames ?? path.keys)[number];
+  if (!frame) throw new Error(`the path has no camera ${number}`);
   const { width, height } = path;
   const fy = frame.fy ?? height / 2 / Math.tan((frame.fov_y_degrees * Math.PI) / 360);
   const fx = frame.fx ?? fy;

@@ -18,7 +18,7 @@ async def list_audit_entries(
     _principal: Admin, service: ServiceDep, request: Request, response: Response, limit: Limit = 50,
     cursor: Cursor = None,
 ) -> AuditPage:  # fmt: skip
-    """List requested changes, by whom and with what outcome, the newest first.
+    """List requested changes, by whom and with what outcome, the newest first; for administrators.
 
     Single files of datasets are not listed, their commits are; of wrong tokens the first of each address.
     """

@@ -70,7 +70,8 @@ async def read_timeline(
 async def stream_events(
     job_id: JobId, principal: Reader, service: ServiceDep, request: Request,
     last_event_id: Annotated[
-        str | None, Header(max_length=40, description="Id of the last event that has arrived.")
+        str | None,
+        Header(alias="Last-Event-ID", max_length=40, description="Id of the last event that has arrived."),
     ] = None,
     after: After = 0,
 ) -> Response:  # fmt: skip

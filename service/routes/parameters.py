@@ -32,7 +32,9 @@ IfNoneMatch = Annotated[
 ]
 Range = Annotated[
     str | None,
-    Header(max_length=1000, description="A part of the content (RFC 9110), such as `bytes=1000-`."),
+    Header(
+        alias="Range", max_length=1000, description="A part of the content (RFC 9110), such as `bytes=1000-`."
+    ),
 ]
 IfRange = Annotated[
     str | None,

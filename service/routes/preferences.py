@@ -10,6 +10,7 @@ from octasplat.service.settings import MAX_WAIT_SECONDS
 Prefer = Annotated[
     str | None,
     Header(
+        alias="Prefer",
         max_length=1000,
         description="`respond-async` answers at once, `wait=N` after so many seconds at most (RFC 7240), "
         f"which are no more than {MAX_WAIT_SECONDS}.",

@@ -69,7 +69,7 @@ async def change_queue(
 ) -> QueueView:
     """Pause a queue, so that it hands out no jobs, or let it go on; jobs that run are left alone.
 
-    It stays so when the service is restarted.
+    It stays so when the service is restarted. The token must be an administrator's.
     """
     return await actions.set_queue_paused(service, principal, queue, change.paused)
 
@@ -80,7 +80,8 @@ async def change_worker(
 ) -> WorkerView:
     """Drain a worker, so that it finishes what it has and takes nothing new, or let it take jobs again.
 
-    A worker of the same name (`octasplat worker --name`) is still drained when it starts again.
+    A worker of the same name (`octasplat worker --name`) is still drained when it starts again. The token
+    must be an administrator's.
     """
     return await actions.set_worker_drained(service, principal, worker, change.drained)
 

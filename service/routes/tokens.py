@@ -33,7 +33,10 @@ async def list_tokens(principal: Reader, service: ServiceDep) -> TokenList:
 async def create_token(
     new: NewToken, principal: Admin, service: ServiceDep, response: Response, key: IdempotencyKey = None
 ) -> MadeToken:
-    """Create a token, whose secret is shown this once; a repetition with the same key is answered 409."""
+    """Create a token, whose secret is shown this once; a repetition with the same key is answered 409.
+
+    The token that asks must be an administrator's.
+    """
     made = await actions.create_token(service, principal, new, idempotency_key=key)
     response.headers["Location"] = f"/v1/tokens/{made.id}"
     return made

@@ -54,7 +54,7 @@ class DatasetChange(RequestBody):
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"pinned": True}]})
 
-    name: str | None = Field(None, max_length=200)
+    name: str | None = Field(None, max_length=200, description="What to call it.")
     pinned: bool | None = Field(None, description="Keep it whatever its age.")
 
 
@@ -87,7 +87,7 @@ class DatasetView(BaseModel):
     state: DatasetState = Field(
         description="`open` takes files, `checking` waits for its commit, `committed` never changes again."
     )
-    has_poses: bool = Field(description="Whether it holds a COLMAP model; if not, ask for `poses: auto`.")
+    has_poses: bool = Field(description="Whether it holds poses; if not, a reconstruction finds them.")
     photographs: int
     facts: dict[str, Any] = Field(description="What the check at commit found out.")
     pinned: bool

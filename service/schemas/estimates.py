@@ -34,12 +34,18 @@ class NewEstimate(RequestBody):
         },
     )
 
-    kind: str = Field("reconstruct", max_length=40)
-    dataset_id: uuid.UUID | None = None
-    source_id: uuid.UUID | None = None
-    photographs: list[PhotographSizes] = Field(default_factory=list, max_length=1000)
-    options: dict[str, Any] = Field(default_factory=dict)
-    queue: str = Field("cpu", pattern="^[a-z][a-z0-9_-]{0,40}$")
+    kind: str = Field("reconstruct", max_length=40, description="One of GET /v1/options.")
+    dataset_id: uuid.UUID | None = Field(None, description="The dataset whose photographs count.")
+    source_id: uuid.UUID | None = Field(
+        None, description="A job on whose results it works, and whose photographs count without `dataset_id`."
+    )
+    photographs: list[PhotographSizes] = Field(
+        default_factory=list, max_length=1000, description="Sizes of photographs that are not sent yet."
+    )
+    options: dict[str, Any] = Field(default_factory=dict, description="See GET /v1/options/{kind}.")
+    queue: str = Field(
+        "cpu", pattern="^[a-z][a-z0-9_-]{0,40}$", description="Queue whose workers' cores are reckoned with."
+    )
 
 
 class EstimateView(BaseModel):

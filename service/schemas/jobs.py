@@ -58,7 +58,7 @@ class NewJob(RequestBody):
         "files need nothing else.",
     )
     options: dict[str, Any] = Field(default_factory=dict, description="See GET /v1/options/{kind}.")
-    label: str | None = Field(None, max_length=200)
+    label: str | None = Field(None, max_length=200, description="What you call it.")
     queue: str = Field("cpu", pattern="^[a-z][a-z0-9_-]{0,40}$", description="Workers that take this queue.")
     priority: int = Field(
         0,
@@ -88,7 +88,7 @@ class ViewNote(BaseModel):
 class JobChange(RequestBody):
     """Changes of a job."""
 
-    label: str | None = Field(None, max_length=200)
+    label: str | None = Field(None, max_length=200, description="What to call it.")
     pinned: bool | None = Field(None, description="Keep it whatever its age.")
     view_notes: list[ViewNote] | None = Field(
         None, max_length=MAX_VIEW_NOTES, description="All notes in the 3D view, in place of those there are."
@@ -106,7 +106,11 @@ class RetryRequest(RequestBody):
         },
     )
 
-    start: Literal["checkpoint", "start"] = Field("checkpoint", alias="from")
+    start: Literal["checkpoint", "start"] = Field(
+        "checkpoint",
+        alias="from",
+        description="Where it goes on: at its newest checkpoint, or from the start.",
+    )
     options: dict[str, Any] = Field(
         default_factory=dict,
         description="Settings in the place of the job's own. What changes the training needs `from: start`; "

@@ -25,7 +25,9 @@ class NewScenePreview(RequestBody):
         json_schema_extra={"examples": [{"files": [{"path": "images/0001.jpg", "size_bytes": 123456}]}]},
     )
 
-    files: list[ListedFile] = Field(max_length=MAX_LISTED_FILES)
+    files: list[ListedFile] = Field(
+        max_length=MAX_LISTED_FILES, description="`path` and `size_bytes` of each file below the folder."
+    )
 
 
 class PreviewedFileView(BaseModel):

@@ -15,7 +15,7 @@ TokenScope = Literal["read", "write", "admin", "metrics"]
 class NewToken(RequestBody):
     """Token to create."""
 
-    name: str = Field(max_length=100)
+    name: str = Field(max_length=100, description="What to call it.")
     owner: str = Field(pattern=r"^[A-Za-z0-9._@-]{1,100}$", description="Whose things it shows.")
     scopes: list[TokenScope] = Field(
         min_length=1,

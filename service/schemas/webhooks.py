@@ -56,10 +56,10 @@ class WebhookChange(RequestBody):
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"enabled": True}]})
 
-    url: Url | None = None
-    events: Events | None = None
-    secret: Secret | None = None
-    enabled: bool | None = None
+    url: Url | None = Field(None, description="https, port 443 or 8443, reachable from everywhere.")
+    events: Events | None = Field(None, description="What it is told of.")
+    secret: Secret | None = Field(None, description="Signs the messages from now on.")
+    enabled: bool | None = Field(None, description="Whether messages are sent.")
 
 
 class WebhookView(BaseModel):

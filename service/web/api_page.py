@@ -85,7 +85,7 @@ def _api_operation(method: str, path: str, operation: Mapping[str, Any]) -> ApiO
             Parameter(
                 parameter["in"],
                 parameter["name"],
-                _type_text(parameter.get("schema", {})),
+                _type_text(parameter.get("schema", {})) + _range_text(parameter.get("schema", {})),
                 parameter.get("description", ""),
                 parameter.get("required", False),
             )
@@ -109,3 +109,12 @@ def _type_text(schema: Mapping[str, Any]) -> str:
     if schema.get("type") == "array":
         return f"list of {_type_text(schema.get('items', {}))}"
     return str(schema.get("format") or schema.get("type", "any"))
+
+
+def _range_text(schema: Mapping[str, Any]) -> str:
+    """Return the range of a number and the default of a parameter, behind its type; empty without either."""
+    least, most, default = schema.get("minimum"), schema.get("maximum"), schema.get("default")
+    text = ""
+    if least is not None:
+        text = f", {least} to {most}" if most is not None else f", at least {least}"
+    return text + ("" if default is None or default in ("", False) else f"; by default {default}")

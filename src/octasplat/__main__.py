@@ -14,7 +14,7 @@ from octasplat.workers.cli.main import cli, main
 def api(ctx: click.Context) -> None:
     """Run the HTTP front end alone, configured by the environment.
 
-    The settings are in octasplat/service/settings.py, each given as OCTASPLAT_NAME. The address goes to
+    docs/service_settings.md lists the settings, each a variable such as OCTASPLAT_NAME. The address goes to
     standard output once requests are taken. On SIGTERM, requests in progress are finished and streams end.
     """
     from octasplat.service.serving import main as serve_api

@@ -5,7 +5,7 @@ import html
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 from jaxtyping import Float32, Int32
@@ -106,7 +106,7 @@ class Image:
 
 
 @names_checked
-def render_view(
+def render(
     scene: Scene,
     camera: PinholeCamera,
     *,
@@ -125,13 +125,16 @@ def render_view(
         threads: 0 takes all cores; the result does not depend on it.
 
     Raises:
-        ConfigError: materials are asked for, and the scene has none, or no light.
+        ConfigError: materials are asked for, and the scene has none, or no light; or the background or the
+            shading is none.
     """
     from octasplat.engine.gaussians.materials import is_material_known
-    from octasplat.engine.render.renderer import background_color
     from octasplat.engine.render.shots import scene_image
     from octasplat.engine.shading.plain import PLAIN_SHADING
 
+    behind = _background_color(background)
+    if shading not in (None, *get_args(Shading)):
+        raise ConfigError(f"shading: {shading!r} is neither 'materials' nor 'harmonics'.")
     is_lit = scene.materials is not None and bool(is_material_known(scene.gaussians).all())
     if shading == "materials" and not is_lit:
         raise ConfigError(
@@ -140,7 +143,6 @@ def render_view(
         )
     materials = scene.materials if is_lit and shading != "harmonics" else None
 
-    behind = background_color(background) if isinstance(background, str) else np.array(background, np.float32)
     rays = camera.rays()
     rendered = scene_image(
         _build_tracer(scene, threads, materials),
@@ -153,6 +155,23 @@ def render_view(
     return Image(
         rendered.rgb_srgb, rendered.depth, rendered.normal_world, rendered.alpha, scene, rays, threads
     )
+
+
+def _background_color(background: Background) -> Float32[np.ndarray, "3"]:
+    """Return the display values of a background; refuses other names, and what are no display values."""
+    from octasplat.engine.render.renderer import background_color
+
+    if isinstance(background, str) and background in ("black", "white"):
+        return background_color(background)
+    try:
+        color = np.array(background, np.float32)
+    except (TypeError, ValueError):
+        color = np.zeros(0, np.float32)
+    if color.shape != (3,) or not ((color >= 0) & (color <= 1)).all():
+        raise ConfigError(
+            f"background: {background!r} is neither 'black', 'white' nor three display values from 0 to 1."
+        )
+    return color
 
 
 def _build_tracer(scene: Scene, threads: int, materials: "DeferredShading | None" = None) -> "Tracer":

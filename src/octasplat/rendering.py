@@ -2,9 +2,9 @@
 
 from typing import TYPE_CHECKING, Any, Unpack, overload
 
-from octasplat import verbs
+from octasplat import images, verbs
 from octasplat.engine.render.pinhole_camera import PinholeCamera
-from octasplat.images import Background, Image, Shading, render_view
+from octasplat.images import Background, Image, Shading
 from octasplat.paths import PathLike
 from octasplat.scenes import Scene
 
@@ -56,7 +56,7 @@ def render(source: Scene | PathLike, target: PinholeCamera | PathLike, /, **opti
     3
     """
     if isinstance(source, Scene) and isinstance(target, PinholeCamera):
-        return render_view(source, target, **options)
+        return images.render(source, target, **options)
     if isinstance(source, Scene) or isinstance(target, PinholeCamera):
         raise TypeError("a scene in memory goes with a camera, a file or run with a place for pictures")
     return verbs.render(source, target, **options)

@@ -163,11 +163,11 @@ class Scene:
     @sh.setter
     def sh(self, values: Float[np.ndarray, "n k 3"]) -> None:
         coefficients = np.asarray(values)
+        _check_sh(coefficients, len(self))
         if coefficients.shape == self.gaussians.sh.shape:
             # In place, as somebody may hold a view of the array.
             self.gaussians.sh[...] = coefficients
         else:  # of another degree
-            _check_sh(coefficients, len(self))
             self.gaussians.sh = np.array(coefficients, np.float32)
 
     @property
@@ -225,12 +225,17 @@ class Scene:
 
         They see nothing nearer than the scene's file says.
 
+        Raises:
+            ConfigError: there are no frames, or an image has no pixels or no field of view.
+
         >>> import octasplat as osp
         >>> len(osp.load("scene.ply").turntable(12))
         12
         """
+        from octasplat.engine.render.pinhole_camera import check_lens
         from octasplat.engine.render.shots import gaussian_turntable, turntable_cameras
 
+        check_lens(width, height, fov)
         table = gaussian_turntable(self.gaussians, fov_y_degrees=fov, aspect=width / height)
         cameras = turntable_cameras(table, frames, width, height, fov)
         return tuple(replace(camera, near_world=self.facts.near_world) for camera in cameras)
@@ -258,10 +263,14 @@ class Scene:
 
 
 def _rows(name: str, values: Float[np.ndarray, "..."], shape: tuple[int, ...]) -> Float32[np.ndarray, "..."]:
-    """Return a copy as float32; refuses another shape."""
+    """Return a copy as float32; refuses another shape, and what no file of a scene may hold."""
     rows = np.array(values, np.float32)
     if rows.shape != shape:
         raise ConfigError(f"{name}: has the shape {rows.shape}; it must be {shape}.")
+    if not np.isfinite(rows).all():
+        raise ConfigError(f"{name}: must be finite.")
+    if name == "quats" and not rows.any(axis=1).all():
+        raise ConfigError("quats: must be rotations, and 0 0 0 0 is none.")
     return rows
 
 
@@ -275,6 +284,8 @@ def _check_sh(values: Float[np.ndarray, "..."], count: int) -> None:
     shape = values.shape
     if len(shape) != 3 or shape[0] != count or shape[1] not in (1, 4, 9, 16) or shape[2] != 3:
         raise ConfigError(f"sh: has the shape {shape}; it must be ({count}, k, 3) with k 1, 4, 9 or 16.")
+    if not np.isfinite(values).all():
+        raise ConfigError("sh: must be finite.")
 
 
 def _log_scales(scales: Float[np.ndarray, "..."]) -> Float64[np.ndarray, "..."]:

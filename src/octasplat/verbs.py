@@ -151,8 +151,7 @@ def reconstruct(
         depth_unit: World units for one unit of the values of depth maps (depths/); by default the
             sparse points decide, or metres where there are too few (0.001 for integers).
         evaluation_background: What lies behind renders and photographs with alpha when they are
-            compared; by default that of the training: white where train.background is white, else
-            black.
+            compared; by default that of the training: white where background is white, else black.
         georeference: What says where the scene lies, how large it is, and what is up: auto takes
             control points, else the GPS positions in the photographs where they agree with the scene;
             gps refuses the photographs where these do not; off looks for nothing, so that no file says
@@ -316,8 +315,7 @@ def estimate(
         depth_unit: World units for one unit of the values of depth maps (depths/); by default the
             sparse points decide, or metres where there are too few (0.001 for integers).
         evaluation_background: What lies behind renders and photographs with alpha when they are
-            compared; by default that of the training: white where train.background is white, else
-            black.
+            compared; by default that of the training: white where background is white, else black.
         georeference: What says where the scene lies, how large it is, and what is up: auto takes
             control points, else the GPS positions in the photographs where they agree with the scene;
             gps refuses the photographs where these do not; off looks for nothing, so that no file says
@@ -474,8 +472,7 @@ def plan(
         depth_unit: World units for one unit of the values of depth maps (depths/); by default the
             sparse points decide, or metres where there are too few (0.001 for integers).
         evaluation_background: What lies behind renders and photographs with alpha when they are
-            compared; by default that of the training: white where train.background is white, else
-            black.
+            compared; by default that of the training: white where background is white, else black.
         georeference: What says where the scene lies, how large it is, and what is up: auto takes
             control points, else the GPS positions in the photographs where they agree with the scene;
             gps refuses the photographs where these do not; off looks for nothing, so that no file says
@@ -731,12 +728,13 @@ def surface(
         refine_vertices: Move vertices along their normals to where the pictures agree, before colors.
         keep_components: Keep so many connected parts only, largest first. [default: by min_component]
         min_component: Remove parts of less than this share of the largest part's area. Default: 0.01.
-        fill_holes: Close holes with rims shorter than so many voxels; or 'all'. Default: 0.0.
+        fill_holes: Close holes whose rim is no longer than so many voxels; or 'all'. Default: 0.0.
         fit: Of all colors, take those with which the mesh looks as like the pictures as it can.
-        texture_size: Colors in a square texture of this side instead of in the vertices; .glb and .obj.
+        texture_size: Colors in a square texture of this side instead of in the vertices; .glb, .obj and
+            .usdz.
         max_memory_gb: Refuse a volume that takes more memory than this. Default: 4.0.
-        room: What pictures of a room need, where nothing else is said: unbounded, unseen solid,
-            backdrop, settle and finer voxels.
+        room: What pictures of a room need, where nothing else is said: unbounded (not with bounds),
+            unseen solid, backdrop, refine_vertices, and finer voxels than a box has.
         max_triangles: Decimate to so many triangles, such as 60000 or 60k; 5k,50k,500k writes a file
             each, NAME_5k.glb. [default: all]
         materials: Base color, metallic, roughness and normals in textures, to be lit; .glb or .usdz.
@@ -942,8 +940,8 @@ def render(
         resume: Go on with a render that was stopped, if there is one.
         or_anew: Begin anew where the images that are there are of another render.
         frames_folder: Where a video keeps its frames until it is whole. [default: beside it]
-        background: Behind the scene; transparent gives images alpha. [default: that of the run's
-            evaluation, or black]
+        background: Behind the scene; transparent gives images alpha. [default: what the run has learnt,
+            or that of its evaluation; of a file black]
         stage: Meshes, lights and materials that the scene is rendered with, as docs/light.md describes:
             an object, or the text of a stage file. The files that it names are those of the job's
             files_id.
@@ -1098,7 +1096,7 @@ def relight(
         integrator: Method: split-sum is fast, as in training, with traced visibility; path is right, by
             paths of light. Default: split-sum.
         samples: Rays or paths per pixel. [default: 4 rays of split-sum, 64 paths]
-        max_bounces: Most surfaces that a path of light meets. Default: 6.
+        max_bounces: Path: most surfaces that a path of light meets. Default: 6.
         rotation_degrees: Turn the light about the vertical by this angle in degrees. Default: 0.0.
         clamp: Cut the light of the environments off at this radiance: fewer bright specks by paths, and
             weaker lamps.

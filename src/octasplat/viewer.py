@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.events import EventListener
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.engine.runs.run_folder import BLOCKS, CONFIG, SCENE, is_run, run_viewpoints
@@ -78,7 +79,7 @@ def view(
         background: ``black`` or ``white``, to begin with.
 
     Raises:
-        OctasplatError: the source cannot be read.
+        OctasplatError: the source cannot be read, or the port or the background is none.
 
     >>> import octasplat as osp
     >>> viewer = osp.view(osp.load("scene.ply"), open_browser=False)
@@ -116,7 +117,14 @@ def serve_scene(scene: Scene, path: Path | None, *, port: int, background: str) 
         path: where it was read from, which names the page and, of a run, has the cameras; None if nowhere.
         port: where to serve it; 0 takes a free one.
         background: ``black`` or ``white``, to begin with.
+
+    Raises:
+        ConfigError: the port or the background is none.
     """
+    if background not in ("black", "white"):
+        raise ConfigError(f"background: {background!r} is neither 'black' nor 'white'.")
+    if not 0 <= port <= 65535:
+        raise ConfigError(f"port: {port} is none; the highest is 65535, and 0 takes a free one.")
     run = path if path is not None and is_run(path) and (path / CONFIG).exists() else None
     folder = tempfile.TemporaryDirectory(prefix="octasplat-view-")
     try:

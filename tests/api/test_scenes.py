@@ -2,6 +2,7 @@
 
 import logging
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -46,12 +47,33 @@ def test_harmonics_of_another_degree_can_be_assigned(scene_file: Path) -> None:
 
 def test_values_out_of_range_are_refused_and_opaque_ones_are_finite(scene_file: Path) -> None:
     scene = osp.load(scene_file)
-    for name, value in (("scales", 0.0), ("opacities", 1.1), ("opacities", np.nan)):
+    out_of_range = [("scales", 0.0), ("opacities", 1.1), ("opacities", np.nan), ("quats", 0.0)]
+    for name, value in [*out_of_range, ("means", np.nan), ("sh", np.inf)]:
         with pytest.raises(osp.ConfigError, match=f"{name}: must be"):
             setattr(scene, name, np.full_like(getattr(scene, name), value))
     scene.opacities = np.linspace(0, 1, len(scene))
     assert np.isfinite(scene.opacity_logits).all()
     np.testing.assert_allclose(scene.opacities, np.linspace(0, 1, len(scene)), atol=1e-6)
+
+
+def test_what_is_no_picture_is_refused(scene_file: Path) -> None:
+    scene = osp.load(scene_file)
+    camera = scene.camera(16, 12)
+    refused: tuple[dict[str, Any], ...] = (
+        {"background": "grey"}, {"background": (2, 0, 0)}, {"background": 1}, {"shading": "lit"},
+    )  # fmt: skip
+    for options in refused:
+        with pytest.raises(osp.ConfigError, match=f"^{next(iter(options))}: .* is neither"):
+            osp.render(scene, camera, **options)
+    np.testing.assert_allclose(osp.render(scene, camera, background=np.ones(3)).rgb[0, 0], 1)
+    for place in ({"background": "grey"}, {"port": 1 << 16}):
+        with pytest.raises(osp.ConfigError, match=f"^{next(iter(place))}: "):
+            osp.view(scene, open_browser=False, **place)
+    for size, fov in (((0, 12), 50.0), ((16, 12), 200.0), ((16, 12), 0.0)):
+        with pytest.raises(osp.ConfigError, match=r"must be at least 1|between 0 and 180"):
+            scene.camera(*size, fov=fov)
+        with pytest.raises(osp.ConfigError, match=r"must be at least 1|between 0 and 180"):
+            osp.Camera.looking_at((0, 0, -4), (0, 0, 0), *size, fov_y_degrees=fov)
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".spz", ".splat", ".glb"])

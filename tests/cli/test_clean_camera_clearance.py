@@ -59,3 +59,5 @@ def test_clean_removes_gaussians_beyond_what_cameras_see(run, octasplat, tmp_pat
         assert f" {wanted} beyond what the cameras see" in result.output
     result = octasplat("clean", tmp_path / "run", "--dry-run", *only_seen)
     assert " 0 beyond what the cameras see" in result.output
+    result = octasplat("clean", tmp_path / "run" / "scene.ply", "--dry-run", *only_seen, "--min-views", 3)
+    assert "min_views goes with the folder of a run" in result.output

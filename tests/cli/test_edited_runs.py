@@ -129,7 +129,9 @@ def test_transform_with_shear_writes_scene_only(run, octasplat, tmp_path):
     (tmp_path / "matrix.txt").write_text("1 0.5 0 0  0 1 0 0  0 0 1 0")
     for arguments in (("--matrix", tmp_path / "matrix.txt"), ("--scale", -1)):
         done = octasplat("transform", run.output, *arguments, "-o", tmp_path / "out")
-        assert done.exit_code == 0 and "holds the scene alone" in done.stderr, done.output
+        assert (
+            done.exit_code == 0 and "holds the scene alone" in done.stderr and "a scene with" in done.stdout
+        ), done.output
         assert names(tmp_path / "out") == {"scene.ply", "edits.json"}
         for path in (tmp_path / "out").iterdir():
             path.unlink()

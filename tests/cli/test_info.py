@@ -47,6 +47,9 @@ def test_info_of_run_has_views_and_thumbnail(run, octasplat, tmp_path):
 def test_info_not_a_scene_is_refused(octasplat, tmp_path):
     result = octasplat("info", tmp_path / "none.ply")
     assert result.exit_code == 1 and result.stderr.count("\n") == 1 and "none.ply" in result.stderr
+    (tmp_path / "none.ply").touch()
+    result = octasplat("info", tmp_path / "none.ply", "--picture", tmp_path / "look")
+    assert result.exit_code == 1 and "--picture: " in result.stderr and "no name of a .png" in result.stderr
 
 
 def test_info_job_and_request_match_command(run, octasplat, tmp_path):

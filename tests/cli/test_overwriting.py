@@ -174,5 +174,5 @@ def test_file_in_the_place_of_the_output_folder_is_named(octasplat, here, monkey
     (here / "taken").write_bytes(NOT_OURS)
     result = octasplat(*arguments)
     assert result.exit_code == 1, result.output
-    assert "as taken is a file; choose another -o." in result.stderr
+    assert "as taken is a file; choose another place." in result.stderr
     assert (here / "taken").read_bytes() == NOT_OURS

@@ -2,7 +2,9 @@
 
 import json
 import re
+import signal
 import subprocess
+import time
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -14,6 +16,7 @@ from octasplat.engine.files import read_metadata
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from octasplat.engine.render.image_files import read_image
 from tests.support.image_channels import read_channels
+from tests.support.light_scenes import shiny_ball
 
 SIZE = ("--width", 32, "--height", 24)
 
@@ -183,6 +186,7 @@ def test_render_invalid_camera_path_is_named(run, octasplat, tmp_path):
         ["-o", "one.png", "--camera", "0", "0", "1", "--distance", "3"],
         ["-o", "out", "--views", "all", "--look-at", "0", "0", "1"],
         ["-o", "one.mp4", "--turntable", "--background", "transparent"],
+        ["-o", "one.jpg", "--camera", "0", "0", "1"],
     ],
 )
 def test_contradictions_are_usage_errors(run, octasplat, arguments):
@@ -256,3 +260,19 @@ def decode(video, width, height):
     command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
     done = subprocess.run(command, capture_output=True, check=True)
     return np.frombuffer(done.stdout, np.uint8).reshape(-1, height, width, 3)
+
+
+@pytest.mark.exhaustive
+def test_sigterm_stops_a_render_with_a_sentence(start_octasplat, tmp_path):
+    ball = shiny_ball(200, 1.0, albedo=(1.0, 1.0, 1.0), metallic=0.0, roughness=1.0)
+    write_gaussian_ply(ball.without_channels(list(ball.channels)), tmp_path / "ball.ply")
+    turn = ("--turntable", "--frames", 5000, "--width", 64, "--height", 64, "-o", tmp_path / "turn")
+    process = start_octasplat("render", tmp_path / "ball.ply", *turn)
+    end = time.monotonic() + 120
+    while not any(tmp_path.glob("turn/*.png")):
+        assert process.poll() is None and time.monotonic() < end, process.communicate()
+        time.sleep(0.05)
+    process.send_signal(signal.SIGTERM)
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 143
+    assert stderr == "Stopped while rendering; the same command with --resume goes on.\n"

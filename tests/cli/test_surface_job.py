@@ -128,6 +128,9 @@ def test_surface_job_presets_fill_unset_options():
     assert lit.texture_size == MATERIAL_DEFAULTS["texture_size"] and dict(lit.levels) == {"5k": 5000}
     plain = SURFACE.revise(room.model_dump(mode="json"), {"room": False})
     assert plain == SURFACE.resolve({"resolution": 99})
+    boxed = SURFACE.resolve({"room": True, "bounds": "0,0,0,1,1,1"})
+    assert not boxed.unbounded and boxed.resolution == ROOM_DEFAULTS["resolution"]
+    assert SURFACE.revise(boxed.model_dump(mode="json"), {"bounds": None}) == SURFACE.resolve({"room": True})
     request = SurfaceRequest(source="a.ply", output="b.glb", room=True, max_triangles=("5k", "60000"))
     assert request.refine_vertices and [path.name for path in request.outputs] == ["b_5k.glb", "b_60000.glb"]
 

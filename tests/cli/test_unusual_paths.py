@@ -88,3 +88,12 @@ def test_frames_of_a_video_are_beside_the_folder_that_has_no_name_of_its_own(
     Path("film.mp4").touch()
     request = ReconstructRequest(source=Path("film.mp4"), output=Path(name))
     assert scene_folder(request) == tmp_path / "here-frames"
+
+
+@pytest.mark.parametrize("verb", ["reconstruct", "estimate", "plan"])
+def test_renders_of_a_run_are_no_photographs(octasplat, tmp_path, verb):
+    for name in ("config.json", "events.jsonl"):
+        (tmp_path / name).write_text("{}")
+    result = octasplat(verb, tmp_path, *(("-o", tmp_path / "out") if verb == "reconstruct" else ()))
+    assert result.exit_code == 1
+    assert result.stderr.startswith(f"Error: {tmp_path} is the folder of a run; name the folder that holds")

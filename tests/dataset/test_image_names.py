@@ -82,6 +82,18 @@ def test_masks_beside_photographs_are_no_photographs(tmp_path, save_image):
     assert photographs_of_scene(tmp_path) == ["0.jpg", "1.jpg", "2.jpg", "the_mask.png"]
 
 
+def test_pictures_of_a_run_are_no_photographs(tmp_path, save_image):
+    for name in ("config.json", "events.jsonl"):
+        (tmp_path / name).touch()
+    for index in range(3):
+        save_image(tmp_path / f"renders/{index}.png", np.zeros((8, 8, 3), dtype=np.uint8))
+    with pytest.raises(DatasetError, match="is the folder of a run"):
+        photographs_of_scene(tmp_path)
+    for index in range(3):
+        save_image(tmp_path / f"images/{index}.png", np.zeros((8, 8, 3), dtype=np.uint8))
+    assert photographs_of_scene(tmp_path) == ["0.png", "1.png", "2.png"]
+
+
 DISC = np.hypot(*np.mgrid[-12:12, -16:16]) < 9
 
 

@@ -69,6 +69,29 @@ def test_projected_systems_among_the_numbers_of_degrees_are_read(tmp_path: Path,
     assert read_control_file(path).crs == code
 
 
+@pytest.mark.parametrize(
+    ("comments", "crs"),
+    [
+        ("# by a receiver for WGS84\n# EPSG:32632", "EPSG:32632"),
+        ("# WGS84 UTM 32N", "EPSG:32632"),
+        ("# +proj=utm +zone=32 +south", "EPSG:32732"),
+        ("# WGS84", "EPSG:4979"),
+        ("# local metres", None),
+    ],
+)
+def test_comments_of_a_csv_say_the_system(tmp_path: Path, comments: str, crs: str | None) -> None:
+    path = tmp_path / "control_points.csv"
+    path.write_text(f"{comments}\nname,x,y,z\na.jpg,11.5,48.1,520\n", encoding="utf-8")
+    assert read_control_file(path).crs == crs
+
+
+def test_unknown_system_in_a_comment_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "control_points.csv"
+    path.write_text("# UTM zone 32\nname,x,y,z\na.jpg,691632.1,5334761.4,520\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match="'UTM zone 32' is not known"):
+        read_control_file(path)
+
+
 @pytest.mark.parametrize("head", ["EPSG:32632", "WGS84 UTM 32N", "+proj=utm +zone=32 +datum=WGS84"])
 def test_gcp_list_gives_the_similarity(scene, tmp_path, head):
     ground = apply(truth_matrix(), POINTS) + UTM

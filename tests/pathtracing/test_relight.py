@@ -8,6 +8,7 @@ from click.testing import CliRunner, Result
 
 from octasplat.engine.core.color import linear_to_srgb
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
+from octasplat.engine.operations.relight import RelightOptions
 from octasplat.engine.render.environment_files import write_environment
 from octasplat.engine.render.image_files import read_image
 from octasplat.workers.cli.main import cli
@@ -82,6 +83,13 @@ def test_relight_clamp_limits_radiance(scene, tmp_path):
         assert done.exit_code == 0, done.output
         image = read_channels(tmp_path / str(most) / "frame_0000.exr")
         assert image["G"][9:15, 13:19].mean() == pytest.approx(left, rel=0.03)
+
+
+def test_options_of_the_other_integrator_are_named() -> None:
+    options = {"environments": ("a.hdr",), "max_bounces": 3}
+    [sentence] = RelightOptions.model_validate(options).unused()
+    assert "max_bounces" in sentence
+    assert RelightOptions.model_validate({**options, "integrator": "path"}).unused() == ()
 
 
 @pytest.mark.parametrize(("by", "least"), some_daily([("split-sum", 60), ("path", 25)], {("path", 25)}))

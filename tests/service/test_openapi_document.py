@@ -28,6 +28,15 @@ def test_every_parameter_is_described_and_a_server_is_named() -> None:
         if not parameter.get("description")
     ]
     assert nameless == []
+    headers = {
+        parameter["name"]
+        for item in document["paths"].values()
+        for operation in item.values()
+        for parameter in operation.get("parameters", ())
+        if parameter["in"] == "header"
+    }
+    assert {"Range", "Prefer", "Last-Event-ID"} <= headers
+    assert [name for name in headers if not re.fullmatch(r"[A-Z][A-Za-z]*(-[A-Z][A-Za-z]*)*", name)] == []
 
 
 @pytest.mark.parametrize(

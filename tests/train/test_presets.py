@@ -180,6 +180,14 @@ def test_ray_patch_count_must_be_square(ray_patch_rays: int) -> None:
         resolve_config("fast", assignments=[f"ray_patch_rays={ray_patch_rays}"])
 
 
+@pytest.mark.parametrize(
+    "assignment", ["materials.up_world=[0,0,0]", "materials.reflection_ray_slope=[0.1,0]"]
+)
+def test_pairs_and_directions_that_mean_nothing_are_refused(assignment: str) -> None:
+    with pytest.raises(ConfigError, match=assignment.partition("=")[0]):
+        resolve_config("fast", materials=True, assignments=[assignment])
+
+
 def psnr_of(scene: Path, output: Path, *assignments: str, max_side: int | None = None) -> float:
     settings = {"max_side": max_side, "exports": ()}
     config = resolve_config("fast", settings=settings, assignments=assignments)

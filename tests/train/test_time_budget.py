@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from octasplat.engine.core.errors import CancelledError
-from octasplat.engine.core.events import CheckpointWritten, Event
+from octasplat.engine.core.events import CheckpointWritten, Event, Warned
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.pipeline import reconstruct
 from octasplat.engine.runs.config import resolve_config
@@ -39,7 +39,7 @@ def test_time_budget_plan_is_saved_and_reused(tmp_path: Path) -> None:
     config = resolve_config(
         "fast",
         settings={"exports": (), "minutes": 0.1},
-        assignments=["rays_per_batch=256", "probe_rays=256", "checkpoint_every=25"],
+        assignments=["rays_per_batch=256", "probe_rays=256", "checkpoint_every=25", "iterations=9"],
     )
     events: list[Event] = []
 
@@ -48,6 +48,9 @@ def test_time_budget_plan_is_saved_and_reused(tmp_path: Path) -> None:
 
     with pytest.raises(CancelledError):
         reconstruct(scene, output, config, threads=1, progress=events.append, should_stop=stop)
+    assert any(
+        isinstance(event, Warned) and "iterations=9 is passed over" in event.message for event in events
+    )
     plan = TimeBudgetPlan.model_validate_json((output / "plan.json").read_text())
     assert plan.seconds < 6 and plan.max_gaussians <= 8 * 48 * 36
     short = plan.model_copy(update={"iterations": 75})  # a plan is what counts, not the pace of today

@@ -47,7 +47,8 @@ def set_option(command: F) -> F:
         "assignments",
         multiple=True,
         metavar="NAME=VALUE",
-        help="Any setting, e.g. test_every=10 or lr.quat=0.02; may be repeated.",
+        help="An option of the job's kind, or of a reconstruction any setting, e.g. lr.quat=0.02, values as "
+        "JSON; may be repeated.",
     )(command)
 
 

@@ -24,7 +24,7 @@ LINE_INTERVAL_SECONDS = 5.0
 _STAGE_RESULTS = {
     "load": ("Loaded", "photograph"),
     "train": ("Trained", "iteration"),
-    "evaluate": ("Evaluated", "held-out view"),
+    "evaluate": ("Evaluated", "view"),
     "export": ("Exported", "file"),
     "generate": ("Generated", "photograph"),
     "render": ("Rendered", "image"),

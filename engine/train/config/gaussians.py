@@ -28,7 +28,8 @@ class GaussianSettings(Settings):
         0,
         ge=0,
         description="Most Gaussians; more show finer detail, take longer and make larger files. 0: one for "
-        "each 30 pixels of the training views or, of up to 10,000, for each 10.",
+        "each pixels_per_gaussian pixels of the training views, in small captures one for each 10 pixels up "
+        "to 10,000; at most max_gaussians_auto.",
     )
     pixels_per_gaussian: Annotated[int, Unit("px per Gaussian"), ADVANCED] = Field(
         30,

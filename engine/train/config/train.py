@@ -47,8 +47,8 @@ class TrainConfig(PhotographSettings, GaussianSettings, RaySettings):
         ge=0,
         le=1,
         description="Share of the training in which the rays of a window composite in one order, which is "
-        "several times as fast and a little wrong; not with materials or loss.depth_normal. 0 gives each ray "
-        "its own order throughout.",
+        "several times as fast and a little wrong; not with materials, depth maps or loss.depth_normal. 0 "
+        "gives each ray its own order throughout.",
     )
     lr: LearningRates = Field(LearningRates(), description="Sizes of the steps of the optimiser.")
     loss: LossWeights = Field(LossWeights(), description="Weights of the terms of the loss.")

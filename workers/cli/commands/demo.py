@@ -33,12 +33,14 @@ class DemoRequest(Request):
         "still_life",
         description="What is photographed: a still life on a table, or a street of 112 m for many views.",
     )
-    views: Annotated[int | None, Spelling(metavar="N")] = Field(None, description="Number of photographs.")
+    views: Annotated[int | None, Spelling(metavar="N")] = Field(
+        None, description="Number of photographs.  [default: 40]"
+    )
     width_px: Annotated[int | None, Unit("px"), Spelling(("--width",), metavar="PX")] = Field(
-        None, description="Width of the photographs."
+        None, description="Width of the photographs.  [default: 320]"
     )
     height_px: Annotated[int | None, Unit("px"), Spelling(("--height",), metavar="PX")] = Field(
-        None, description="Height of the photographs."
+        None, description="Height of the photographs.  [default: 240]"
     )
 
 

@@ -6,7 +6,13 @@ import click
 
 
 @click.command(short_help="Run the whole service on this machine.")
-@click.option("--data", type=click.Path(path_type=Path), metavar="FOLDER", help="Where everything is kept.")
+@click.option(
+    "--data",
+    type=click.Path(path_type=Path),
+    metavar="FOLDER",
+    help="Where everything is kept.  [default: OCTASPLAT_DATA, or octasplat in the user's folder of data; of "
+    "root /var/lib/octasplat]",
+)
 @click.option("--host", help="Address to listen at.  [default: 127.0.0.1, this machine only]")
 @click.option("--port", type=click.IntRange(0, 65535), help="Port to listen at.  [default: 8642]")
 @click.option(

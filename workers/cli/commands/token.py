@@ -20,6 +20,10 @@ if TYPE_CHECKING:
 
 SCOPES = ("read", "write", "admin", "metrics")
 
+_data_option = click.option(
+    "--data", type=click.Path(path_type=Path), metavar="FOLDER", help="Data folder of octasplat serve."
+)
+
 
 @click.group(short_help="Who may use the service.")
 def token() -> None:
@@ -29,9 +33,19 @@ def token() -> None:
 @token.command(short_help="Make a token.")
 @click.argument("name")
 @click.option("--owner", help="Whose things it shows.  [default: NAME]")
-@click.option("--scope", "scopes", multiple=True, type=click.Choice(SCOPES), help="[default: write]")
-@click.option("--days", type=click.FloatRange(min=0, min_open=True), help="How long it is valid.")
-@click.option("--data", type=click.Path(path_type=Path), metavar="FOLDER")
+@click.option(
+    "--scope",
+    "scopes",
+    multiple=True,
+    type=click.Choice(SCOPES),
+    help="What it may do; may be repeated.  [default: write]",
+)
+@click.option(
+    "--days",
+    type=click.FloatRange(min=0, min_open=True),
+    help="How long it is valid.  [default: until it is revoked]",
+)
+@_data_option
 @output_options
 def create(
     name: str,
@@ -63,7 +77,7 @@ def create(
 
 
 @token.command("list", short_help="List tokens.")
-@click.option("--data", type=click.Path(path_type=Path), metavar="FOLDER")
+@_data_option
 @output_options
 def list_all(data: Path | None, printer: Printer) -> None:
     """List all tokens, without their secrets."""
@@ -87,7 +101,7 @@ def list_all(data: Path | None, printer: Printer) -> None:
 
 @token.command(short_help="Shut a token out.")
 @click.argument("token_id", type=click.UUID)
-@click.option("--data", type=click.Path(path_type=Path), metavar="FOLDER")
+@_data_option
 @output_options
 def revoke(token_id: uuid.UUID, data: Path | None, printer: Printer) -> None:
     """Revoke the token TOKEN_ID, with the browser sessions that were begun with it."""
