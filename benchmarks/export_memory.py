@@ -109,11 +109,17 @@ def anonymous_bytes(pid: int) -> int:
 
 
 def children_of(pid: int) -> list[int]:
-    """Ids of the processes that a process has started."""
+    """Return the ids of the programs that a process has started."""
     try:
-        return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+        children = [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+        # until it is another program it shares the memory of the one that starts it
+        return [child for child in children if _command_of(child) != _command_of(pid)]
     except OSError:
         return []
+
+
+def _command_of(pid: int) -> bytes:
+    return Path(f"/proc/{pid}/cmdline").read_bytes()
 
 
 def measure(action: str, name: str, path: Path, count: int, sh_degree: int) -> tuple[float, int, int]:
@@ -122,12 +128,25 @@ def measure(action: str, name: str, path: Path, count: int, sh_degree: int) -> t
     Raises:
         RuntimeError: the step failed.
     """
-    command = [sys.executable, "-m", "benchmarks.export_memory", str(count), "--step", action]
-    command += ["--format", name, "--sh-degree", str(sh_degree), "--folder", str(path)]
+    command = ["benchmarks.export_memory", str(count), "--step", action]
+    return measured([*command, "--format", name, "--sh-degree", str(sh_degree), "--folder", str(path)])
+
+
+def measured(module: list[str]) -> tuple[float, int, int]:
+    """Run a module that tells where its work begins and ends; return what :func:`measure` does.
+
+    Args:
+        module: its name, and arguments.
+
+    Raises:
+        RuntimeError: it failed.
+    """
+    failure = RuntimeError(f"{' '.join(module)} failed")
+    command = [sys.executable, "-m", *module]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdin is not None and process.stdout is not None
         if process.stdout.readline().strip() != READY:
-            raise RuntimeError(f"{action} of {name} failed")
+            raise failure
         before = peak = anonymous_bytes(process.pid)
         process.stdin.write("\n")
         process.stdin.flush()
@@ -135,7 +154,7 @@ def measure(action: str, name: str, path: Path, count: int, sh_degree: int) -> t
             peak = max(peak, anonymous_bytes(process.pid))
         words = process.stdout.readline().split()
         if words[:1] != [DONE]:
-            raise RuntimeError(f"{action} of {name} failed")
+            raise failure
         process.stdin.write("\n")
         process.stdin.flush()
     return float(words[1]), peak - before, int(words[2])

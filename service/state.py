@@ -10,6 +10,7 @@ from fastapi import Depends, Request
 from octasplat.service.event_broker import EventBroker
 from octasplat.service.eviction import SpaceEvictor
 from octasplat.service.intake.spool import SpoolSpace
+from octasplat.service.live_scene_file import KeptRows
 from octasplat.service.login_throttle import LoginThrottle
 from octasplat.service.metrics import Metrics
 from octasplat.service.settings import ServiceSettings
@@ -33,6 +34,7 @@ class Service:
         spool_space: room for archives while they are read.
         task_added: set when a task on a dataset was added, which this process may take.
         storage_check: what the store was last found to be, or is being.
+        live_rows: rows of files of live scenes that were read.
         metrics: counts what this process does.
         is_draining: whether it is about to stop.
         started_at: monotonic time.
@@ -48,6 +50,7 @@ class Service:
     spool_space: SpoolSpace
     task_added: asyncio.Event = field(default_factory=asyncio.Event)
     storage_check: "asyncio.Future[str] | None" = None
+    live_rows: KeptRows = field(default_factory=KeptRows)
     metrics: Metrics = field(default_factory=Metrics)
     is_draining: bool = False
     started_at: float = field(default_factory=time.monotonic)

@@ -1,6 +1,6 @@
 """Merge of the blocks of a scene, and the training that follows: of all together, or of what is near cuts."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from octasplat.engine.blocks.block_dataset import BlockDataset
+from octasplat.engine.blocks.core_merge import merge_cores
 from octasplat.engine.blocks.piece_progress import PieceProgress
 from octasplat.engine.blocks.piece_settings import (
     POLISH_FRACTION,
@@ -16,12 +17,11 @@ from octasplat.engine.blocks.piece_settings import (
 )
 from octasplat.engine.blocks.piece_training import BlockWork, Piece, piece_record, train_piece
 from octasplat.engine.blocks.pixel_selection import select_pixels
-from octasplat.engine.blocks.scene_plan import COARSE, FINISH, POLISH, ScenePlan, block_name
+from octasplat.engine.blocks.scene_plan import COARSE, FINISH, POLISH, ScenePlan
 from octasplat.engine.core.errors import CancelledError
 from octasplat.engine.core.events import Noted
-from octasplat.engine.gaussians.merge import with_sh_degree
-from octasplat.engine.gaussians.model import FlatGaussians, concatenate
-from octasplat.engine.gaussians.simplification import simplify
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.rows import select_into_files
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import Tracer
@@ -39,7 +39,7 @@ class BlockScene:
     """A scene that was trained in blocks.
 
     Attributes:
-        gaussians: of all blocks, those of one after those of the other.
+        gaussians: of all blocks, those of one after those of the other; they may be in files without a name.
         shading: exposures and background, those of the last piece that learnt them.
         record: what each training took, for ``training.json``.
     """
@@ -63,16 +63,7 @@ def finish_scene(work: BlockWork, plan: ScenePlan, tell: PieceProgress) -> Block
         CancelledError: stopped as asked.
     """
     coarse = load_best(work.folder / COARSE)
-    numbers = range(1, len(plan.blocks) + 1)
-    cores = _limit_cores(work.config, [_core_of_block(work, plan, number, coarse) for number in numbers])
-    is_near_cut = np.concatenate(
-        [
-            ~block.core.grown(-block.margin_world).contains(core.means_world)
-            for block, core in zip(plan.blocks, cores, strict=True)
-        ]
-    )
-    merged = concatenate(cores)
-    del cores
+    merged, is_near_cut = merge_cores(work.folder, work.config, plan, coarse)
     if plan.is_finished_together:
         finished = _finish(work, plan, merged, coarse, tell)
     else:
@@ -82,29 +73,6 @@ def finish_scene(work: BlockWork, plan: ScenePlan, tell: PieceProgress) -> Block
     return BlockScene(finished.gaussians, shading, {name: piece_record(work, name) for name in pieces})
 
 
-def _core_of_block(work: BlockWork, plan: ScenePlan, number: int, coarse: BestState) -> FlatGaussians:
-    """Return the Gaussians of a block's core; those of the coarse scene where few views show it."""
-    block = plan.blocks[number - 1]
-    found = load_best(work.folder / block_name(number)) if block.is_trained else coarse
-    core = found.gaussians.select(block.core.contains(found.gaussians.means_world))
-    return with_sh_degree(core, work.config.sh_degree)
-
-
-def _limit_cores(config: TrainConfig, cores: Sequence[FlatGaussians]) -> list[FlatGaussians]:
-    """Return the cores with as many Gaussians as the whole scene may have; those that look alike are merged.
-
-    Blocks share that number by what they and their margins show, so that the cores may have a few more.
-    """
-    ends = np.cumsum([len(core) for core in cores])
-    if not 0 < config.max_gaussians < ends[-1]:
-        return list(cores)
-    counts = np.diff(ends * config.max_gaussians // ends[-1], prepend=0).tolist()
-    return [
-        simplify(core, max(1, count)) if len(core) else core
-        for core, count in zip(cores, counts, strict=True)
-    ]
-
-
 def _finish(
     work: BlockWork, plan: ScenePlan, merged: FlatGaussians, coarse: BestState, tell: PieceProgress
 ) -> BestState:
@@ -112,7 +80,7 @@ def _finish(
 
     def start() -> TrainState:
         work.progress(Noted(f"All blocks are finished together, {len(merged)} Gaussians."))
-        state = initial_state(merged, work.config.seed)
+        state = initial_state(merged.copy(), work.config.seed)  # from files to memory
         state.shading = dict(coarse.shading)
         return state
 
@@ -148,7 +116,8 @@ def _polish(
         state.shading = dict(coarse.shading)
         return state
 
-    piece = Piece(POLISH, data, config, start, merged.select(~is_near_cut), keeps_near_free=False)
+    fixed = select_into_files(merged, ~is_near_cut, work.folder)
+    piece = Piece(POLISH, data, config, start, fixed, is_fixed_in_files=True, keeps_near_free=False)
     polished = train_piece(work, piece, tell.of_piece(POLISH))
     merged.put(is_near_cut, polished.gaussians)
     return merged

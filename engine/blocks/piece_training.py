@@ -59,6 +59,8 @@ class Piece:
         config: settings of it.
         start: makes the state before its first iteration.
         fixed_gaussians: Gaussians that are seen, too, and stay as they are.
+        is_fixed_in_files: whether what is traced, fixed Gaussians and others, is in files meanwhile: for many
+            fixed ones and a number of others that stays.
         keeps_near_free: whether no Gaussian stays near to a camera.
     """
 
@@ -67,6 +69,7 @@ class Piece:
     config: TrainConfig
     start: Callable[[], TrainState]
     fixed_gaussians: FlatGaussians | None = None
+    is_fixed_in_files: bool = False
     keeps_near_free: bool = True
 
 
@@ -109,6 +112,7 @@ def train_piece(work: BlockWork, piece: Piece, progress: EventListener) -> BestS
     if piece.keeps_near_free and config.camera_clearance > 0:
         nearest_world = camera_clearances(viewpoints, work.dataset.points)
         zones = CameraClearance.from_views(viewpoints, config.camera_clearance * nearest_world, trained)
+    checkpoints.mkdir(parents=True, exist_ok=True)
     trainer = Trainer(
         piece.data,
         config,
@@ -121,6 +125,7 @@ def train_piece(work: BlockWork, piece: Piece, progress: EventListener) -> BestS
         min_scale=MinScale.of_views(viewpoints, trained, config.min_scale_px),
         camera_clearance=zones,
         fixed_gaussians=piece.fixed_gaussians,
+        is_fixed_in_files=piece.is_fixed_in_files,
     )
     gaussians = trainer.run()
     record = {

@@ -132,7 +132,7 @@ def evaluate_scales(
     config = _finished_config(output, background)
     dataset = _open_photographs(output, config, scene, threads, listener)
     _check_coordinates(output, dataset, photographs_folder(output, scene))
-    gaussians, _ = read_gaussian_ply(output / SCENE)
+    gaussians, _ = read_gaussian_ply(output / SCENE, folder=output)
     extent = run_extent(output, dataset.extent)
     shading = finished_shading(
         output, shown_options(config.train, gaussians), extent, [view.name for view in dataset.views]
@@ -207,7 +207,7 @@ def measure_run(
     the exposures that it has learnt.
     """
     truth = _find_ground_truth(dataset, progress, needed=into is not None)
-    gaussians, _ = read_gaussian_ply(output / SCENE)
+    gaussians, _ = read_gaussian_ply(output / SCENE, folder=output)
     extent = run_extent(output, dataset.extent)
     environment = _read_run_environment(output, config.train.materials.up_world)
     relighter = None

@@ -167,6 +167,7 @@ def read_gaussian_ply(
     dialect: PlyDialect = "3dgs",
     drop_invalid: bool = False,
     channels: ChannelChoice = "own",
+    folder: Path | None = None,
 ) -> tuple[FlatGaussians, ImportReport]:
     """Read a PLY of Gaussians, flat or not, by property name.
 
@@ -178,12 +179,14 @@ def read_gaussian_ply(
         dialect: what its scales mean.
         drop_invalid: leave out Gaussians with values that are not finite, instead of refusing the file.
         channels: which properties become channels beside the parameters.
+        folder: for files that hold a large scene, see :func:`octasplat.engine.gaussians.flattening.flatten`.
 
     Raises:
         SceneFileError: the file is not a PLY, is truncated, holds compressed or no Gaussians, lacks a
             property, or holds values that are not finite.
     """
-    return flatten(read_ply_blocks(path, channels, dialect), path, drop_invalid=drop_invalid)
+    found = read_ply_blocks(path, channels, dialect)
+    return flatten(found, path, drop_invalid=drop_invalid, folder=folder)
 
 
 def read_ply_cloud(

@@ -13,7 +13,7 @@ def kd_split(points_world: Float[np.ndarray, "n 3"], max_chunks: int) -> list[In
     Each part is halved at the median along the axis on which it spreads most, while there may be twice as
     many chunks and none falls below ``MIN_CHUNK_SIZE`` points. Within a chunk the order is ascending.
     """
-    chunks = [_all_rows(points_world)]
+    chunks = [all_rows(points_world)]
     while 2 * len(chunks) <= max_chunks and len(points_world) // (2 * len(chunks)) >= MIN_CHUNK_SIZE:
         chunks = [half for chunk in chunks for half in _split_in_half(points_world, chunk)]
     return [np.sort(chunk) for chunk in chunks]
@@ -46,7 +46,7 @@ def _column_sums(
     return np.asarray(total[0])
 
 
-def _all_rows(points_world: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
+def all_rows(points_world: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
     """Return the numbers of all points, of 32 bits where these do, as they are most of what is in memory."""
     kind = np.int32 if len(points_world) <= np.iinfo(np.int32).max else np.int64
     return np.arange(len(points_world), dtype=kind)
@@ -60,7 +60,7 @@ def kd_order(points_world: Float[np.ndarray, "n 3"], chunk: int) -> Int[np.ndarr
     their own instead of setting the scale for everything.
     """
     done: list[np.ndarray] = []
-    waiting = [_all_rows(points_world)]
+    waiting = [all_rows(points_world)]
     while waiting:
         part = waiting.pop()
         if len(part) <= chunk:

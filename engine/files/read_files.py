@@ -29,6 +29,7 @@ def read_scene(
     drop_invalid: bool = False,
     channels: ChannelChoice = "own",
     progress: EventListener = ignore_events,
+    folder: Path | None = None,
 ) -> tuple[FlatGaussians, ImportReport]:
     """Read the Gaussians of a file of any known format, or of the folder of a run, and flatten them.
 
@@ -39,6 +40,7 @@ def read_scene(
         channels: which named channels are wanted: those that the file says are channels, as ours do; all that
             nothing else is known of, too; or names.
         progress: receives events when reading begins and ends (stage ``read``).
+        folder: for files that hold a large scene, see :func:`octasplat.engine.gaussians.flattening.flatten`.
 
     Returns:
         Flat Gaussians, and what flattening and reading lost.
@@ -53,7 +55,7 @@ def read_scene(
             raise SceneFileError(f"{source}: the format {importer.name} has no place for channels.")
         read = importer.read_blocks
         cloud = importer.read(source) if read is None else read(source, channels)
-        return flatten(cloud, source, drop_invalid=drop_invalid)
+        return flatten(cloud, source, drop_invalid=drop_invalid, folder=folder)
 
 
 def read_metadata(path: Path) -> SceneMetadata:

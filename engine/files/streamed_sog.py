@@ -11,6 +11,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float32
 
 from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.files.export_options import ExportOptions
@@ -28,6 +29,8 @@ _CHUNK_META = re.compile(r"(\d+_\d+)/meta\.json")
 MAX_LEVELS = 6
 MIN_LEVEL_COUNT = 5_000
 """Fewer Gaussians are not thinned any more: they are loaded at once."""
+SPREAD_QUANTILES = (0.02, 0.98)
+"""Between which most Gaussians lie."""
 CHUNKS_ACROSS = 4
 """Chunks along the longest side of where most Gaussians lie; more where these are too many for one."""
 
@@ -41,12 +44,11 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     """
     scene = select_for_export(gaussians, path, options)
     former = former_folders(path, _chunk_names(path), _are_of_a_chunk)
-    low, high = np.quantile(scene.means_world, [0.02, 0.98], axis=0)
-    extent_world = float((high - low).max()) / CHUNKS_ACROSS
+    extent_world = max(map(_spread, scene.means_world.T)) / CHUNKS_ACROSS
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="octasplat-", dir=path.parent) as folder:
         levels: list[Path] = []
-        for level in iterate_levels(scene, MIN_LEVEL_COUNT, MAX_LEVELS):
+        for level in iterate_levels(scene, MIN_LEVEL_COUNT, Path(folder), MAX_LEVELS):
             levels.append(Path(folder) / f"level_{len(levels)}.ply")
             write_gaussian_ply(level, levels[-1])
         index = Path(folder) / "packed" / INDEX_FILE
@@ -56,6 +58,12 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
         except SceneFileError as error:
             raise SceneFileError(str(error).replace(str(index), str(path), 1)) from error
         return move_into_place(index, path, former)
+
+
+def _spread(coordinates: Float32[np.ndarray, " n"]) -> float:
+    """Return how far most of some coordinates lie apart."""
+    low, high = np.quantile(coordinates, SPREAD_QUANTILES)
+    return float(high - low)
 
 
 def _chunk_names(path: Path) -> frozenset[str]:

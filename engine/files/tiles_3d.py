@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int
 
 from octasplat.engine.core.earth_frame import geocentric_from_metres
 from octasplat.engine.core.local_origin import is_set
@@ -56,7 +56,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
         index = Path(folder) / INDEX_FILE
         (index.parent / CONTENT_FOLDER).mkdir()
         contents: dict[tuple[int, int], TileContent] = {}
-        for finer, level in enumerate(iterate_levels(scene, FEWEST_IN_ROOT)):
+        for finer, level in enumerate(iterate_levels(scene, FEWEST_IN_ROOT, Path(folder))):
             at = depth - finer
             numbers = cells.cells_of(level.means_world, at)
             for cell, part in _parts(level, numbers):
@@ -85,12 +85,13 @@ def root_transform(facts: SceneMetadata) -> Float64[np.ndarray, "4 4"] | None:
     return np.asarray(placed @ _TILE_FROM_SCENE.T)
 
 
-def _parts(level: FlatGaussians, numbers: np.ndarray) -> Iterator[tuple[int, FlatGaussians]]:
+def _parts(level: FlatGaussians, numbers: Int[np.ndarray, " n"]) -> Iterator[tuple[int, FlatGaussians]]:
     """Yield the cells that have Gaussians with these, in their order."""
     order = np.argsort(numbers, kind="stable")
-    found, starts = np.unique(numbers[order], return_index=True)
-    for cell, rows in zip(found.tolist(), np.split(order, starts[1:]), strict=True):
-        yield cell, level.select(rows)
+    ends = np.cumsum(np.bincount(numbers))
+    for cell, rows in enumerate(np.split(order, ends[:-1])):
+        if len(rows):
+            yield cell, level.select(rows)
 
 
 def _write_content(part: FlatGaussians, index: Path, uri: str) -> TileContent:

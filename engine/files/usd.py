@@ -7,6 +7,7 @@ usd-core (the extra ``usd``).
 
 import shutil
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -16,6 +17,7 @@ from jaxtyping import Float32
 
 from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.core.file_arrays import new_array
 from octasplat.engine.core.local_origin import is_set
 from octasplat.engine.core.writing import atomic_replace
 from octasplat.engine.files.encodings import half_turn_points, half_turn_quats, half_turn_sh, unit_quats
@@ -53,7 +55,12 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     check_scales(scene, path)
     pxr = _import_usd(path)
     suffix = ".usdc" if path.suffix.lower() in (".usdz", ".usd") else path.suffix.lower()
-    with tempfile.TemporaryDirectory(prefix="octasplat-") as folder, atomic_replace(path) as temporary:
+    place = path.parent
+    place.mkdir(parents=True, exist_ok=True)
+    with (
+        tempfile.TemporaryDirectory(prefix="octasplat-", dir=place) as folder,
+        atomic_replace(path) as temporary,
+    ):
         layer = Path(folder) / f"scene{suffix}"
         _write_stage(pxr, scene, layer, options.facts)
         if path.suffix.lower() == ".usdz":
@@ -84,6 +91,36 @@ def _packed_orientations(scene: FlatGaussians) -> Float32[np.ndarray, "n 4"]:
     return np.asarray(quats.astype(np.float32)[:, [1, 2, 3, 0]])  # x, y, z, w
 
 
+def _three_scales(scene: FlatGaussians) -> Float32[np.ndarray, "n 3"]:
+    """Return standard deviations, that along the normal last."""
+    return np.concatenate([scene.scales, np.full((len(scene), 1), FLAT_SCALE, np.float32)], axis=1)
+
+
+def _extent(scene: FlatGaussians) -> tuple[Float32[np.ndarray, "3"], Float32[np.ndarray, "3"]]:
+    """Return the corners of a box about Gaussians turned to y up."""
+    means = half_turn_points(scene.means_world)
+    reach = EXTENT_SIGMAS * scene.scales.max(axis=1, keepdims=True)
+    return (means - reach).min(axis=0), (means + reach).max(axis=0)
+
+
+def _in_file(scene: FlatGaussians, folder: Path, make: Callable[[FlatGaussians], np.ndarray]) -> np.ndarray:
+    """Return what is made of each block, one after the other, in a file without a name.
+
+    Args:
+        scene: not empty.
+        folder: for the file.
+        make: returns as many rows for each Gaussian.
+    """
+    first = make(scene.view(slice(0, 1)))
+    found = new_array((len(first) * len(scene), *first.shape[1:]), first.dtype, folder)
+    end = 0
+    for block in iterate_blocks(scene):
+        part = make(block)
+        found[end : end + len(part)] = part
+        end += len(part)
+    return found
+
+
 def _write_stage(pxr: dict[str, ModuleType], scene: FlatGaussians, layer: Path, facts: SceneMetadata) -> None:
     usd, geom, vol, vt = (pxr[name] for name in ("Usd", "UsdGeom", "UsdVol", "Vt"))
     stage = usd.Stage.CreateNew(str(layer))
@@ -108,27 +145,27 @@ def _write_stage(pxr: dict[str, ModuleType], scene: FlatGaussians, layer: Path, 
     def attribute(name: str, values: Any) -> None:
         prim.GetAttribute(name).Set(values)
 
-    # Each is turned to y up by itself, so that the scene is not in memory twice.
-    means = half_turn_points(scene.means_world)
-    attribute("positions", vt.Vec3fArray.FromNumpy(means))
-    quats = np.concatenate([_packed_orientations(block) for block in iterate_blocks(scene)])
-    attribute("orientations", vt.QuatfArray.FromNumpy(quats))
-    del quats
-    scales = np.concatenate([scene.scales, np.full((len(scene), 1), FLAT_SCALE, np.float32)], axis=1)
-    attribute("scales", vt.Vec3fArray.FromNumpy(scales))
-    attribute("opacities", vt.FloatArray.FromNumpy(scene.opacities))
+    def made(make: Callable[[FlatGaussians], np.ndarray]) -> np.ndarray:
+        """Return what is made of all blocks; usd-core copies it, so that it need not be in memory as well."""
+        return _in_file(scene, layer.parent, make)
+
+    attribute("positions", vt.Vec3fArray.FromNumpy(made(lambda block: half_turn_points(block.means_world))))
+    attribute("orientations", vt.QuatfArray.FromNumpy(made(_packed_orientations)))
+    attribute("scales", vt.Vec3fArray.FromNumpy(made(_three_scales)))
+    attribute("opacities", vt.FloatArray.FromNumpy(made(lambda block: block.opacities)))
     attribute("radiance:sphericalHarmonicsDegree", scene.sh_degree)
-    flat_sh = half_turn_sh(scene.sh).reshape(-1, 3)
+    flat_sh = made(lambda block: half_turn_sh(block.sh).reshape(-1, 3))
     attribute("radiance:sphericalHarmonicsCoefficients", vt.Vec3fArray.FromNumpy(flat_sh))
     del flat_sh
-    reach = EXTENT_SIGMAS * scales[:, :2].max(axis=1, keepdims=True)
-    extent = np.stack([(means - reach).min(axis=0), (means + reach).max(axis=0)])
+    lows, highs = zip(*map(_extent, iterate_blocks(scene)), strict=True)
+    extent = np.stack([np.min(lows, axis=0), np.max(highs, axis=0)])
     attribute("extent", vt.Vec3fArray.FromNumpy(extent.astype(np.float32)))
     # For programs that know no particle fields, and show colored points
     fallback = geom.Gprim(prim)
-    colors = srgb_to_linear(np.clip(scene.base_rgb_srgb, 0.0, 1.0))
+    colors = made(lambda block: srgb_to_linear(np.clip(block.base_rgb_srgb, 0.0, 1.0)))
     fallback.CreateDisplayColorPrimvar(geom.Tokens.vertex).Set(vt.Vec3fArray.FromNumpy(colors))
-    fallback.CreateDisplayOpacityPrimvar(geom.Tokens.vertex).Set(vt.FloatArray.FromNumpy(scene.opacities))
+    opacities = vt.FloatArray.FromNumpy(made(lambda block: block.opacities))
+    fallback.CreateDisplayOpacityPrimvar(geom.Tokens.vertex).Set(opacities)
     primvars, kinds = geom.PrimvarsAPI(prim), pxr["Sdf"].ValueTypeNames
     for name, values in scene.channels.items():
         primvar = primvars.CreatePrimvar(name, kinds.FloatArray, geom.Tokens.vertex, values.shape[1])

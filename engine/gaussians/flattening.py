@@ -16,6 +16,7 @@ from octasplat.engine.gaussians.rows import (
     RowIndex,
     allocate_rows,
     overwrite_rows,
+    row_arrays,
     select_rows,
     view_rows,
 )
@@ -31,6 +32,10 @@ ROWS_PER_BLOCK = 16384
 """Gaussians that are dealt with at a time, some megabytes of them."""
 _CYCLIC_ROTATIONS = np.array([[1, 0, 0, 0], [0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5]], dtype=np.float32)
 """Quaternions of P_k, whose columns are the axes k, k+1, k+2 (mod 3): they turn axis k into the first."""
+
+
+MANY_BYTES = 256 << 20
+"""Of a scene that is rather in files than in memory, a million Gaussians with harmonics of degree 3."""
 
 
 @dataclass(frozen=True)
@@ -140,7 +145,11 @@ def join_blocks(source: CloudBlocks, path: Path) -> GaussianCloud:
 
 
 def flatten(
-    source: GaussianCloud | CloudBlocks, path: Path, *, drop_invalid: bool = False
+    source: GaussianCloud | CloudBlocks,
+    path: Path,
+    *,
+    drop_invalid: bool = False,
+    folder: Path | None = None,
 ) -> tuple[FlatGaussians, ImportReport]:
     """Flatten each Gaussian along its smallest axis, or along ``normal_axis``, some thousands at a time.
 
@@ -151,6 +160,8 @@ def flatten(
         source: what a file holds.
         path: names the file in errors.
         drop_invalid: leave out Gaussians with values that are not finite, instead of refusing the file.
+        folder: for files without a name that hold the Gaussians where these are many, :data:`MANY_BYTES`;
+            None for memory.
 
     Raises:
         SceneFileError: there are no Gaussians, or some hold values that are not finite or rotations of length
@@ -179,7 +190,7 @@ def flatten(
             cloud = select_rows(cloud, valid)
         block, ratios = _flatten_block(cloud)
         if scene is None:
-            scene = allocate_rows(block, source.count)
+            scene = _allocate_scene(block, source.count, folder)
         scene.put(rows, block)
         kept[rows] = True
         thickness.append(ratios)
@@ -232,6 +243,12 @@ def _flatten_block(cloud: GaussianCloud) -> tuple[FlatGaussians, Float32[np.ndar
 
 
 _NO_LENGTH = "a rotation of length zero"
+
+
+def _allocate_scene(block: FlatGaussians, count: int, folder: Path | None) -> FlatGaussians:
+    """Return a scene of so many Gaussians like those of a block, not filled yet."""
+    is_large = sum(array[:1].nbytes for array in row_arrays(block).values()) * count >= MANY_BYTES
+    return allocate_rows(block, count, folder if is_large else None)
 
 
 def _valid_mask(cloud: GaussianCloud) -> tuple[Bool[np.ndarray, " n"], dict[str, int]]:

@@ -1,6 +1,7 @@
 """Levels of detail of a scene: each has half the Gaussians of the one before, by merging neighbors."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 from octasplat.engine.gaussians.model import FlatGaussians
 
@@ -21,17 +22,23 @@ def level_counts(count: int, fewest: int) -> list[int]:
     return counts
 
 
-def iterate_levels(scene: FlatGaussians, fewest: int, most: int | None = None) -> Iterator[FlatGaussians]:
-    """Yield the levels of a scene, itself first; only one is held at a time.
+def iterate_levels(
+    scene: FlatGaussians, fewest: int, folder: Path, most: int | None = None
+) -> Iterator[FlatGaussians]:
+    """Yield the levels of a scene, itself first; only one is held at a time, the coarser ones in files.
 
     Args:
         scene: the finest level.
         fewest: Gaussians that a level may have, as in :func:`level_counts`.
+        folder: for files that are gone when nobody holds their level.
         most: levels, None for all that there are.
+
+    Raises:
+        DiskFullError: there is no room for the files.
     """
     # imported late: the table of formats is read where nothing is written, too
     from octasplat.engine.gaussians.simplification import simplify
 
     for count in level_counts(len(scene), fewest)[:most]:
-        scene = simplify(scene, count)
+        scene = simplify(scene, count, folder=folder)
         yield scene

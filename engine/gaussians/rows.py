@@ -6,13 +6,18 @@ have no rows. No operation lists fields, so that none can forget one.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import Field, fields, replace
+from pathlib import Path
 from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
+from jaxtyping import Bool
 
+from octasplat.engine.core.file_arrays import new_array
 from octasplat.engine.gaussians.channels import Channels
 
 RowIndex = np.ndarray | slice
+COPIED_ROWS = 16384
+"""At a time, where a copy is in files."""
 
 
 @runtime_checkable
@@ -67,9 +72,23 @@ def select_rows(table: TableT, index: RowIndex) -> TableT:
     return map_rows(table, lambda array: array[index].copy())
 
 
-def allocate_rows(table: TableT, count: int) -> TableT:
-    """Return a table with the columns of another and so many rows, not filled yet."""
-    return map_rows(table, lambda array: np.empty((count, *array.shape[1:]), array.dtype))
+def allocate_rows(table: TableT, count: int, folder: Path | None = None) -> TableT:
+    """Return a table with the columns of another and so many rows, not filled yet; with a folder in files."""
+    return map_rows(table, lambda array: new_array((count, *array.shape[1:]), array.dtype, folder))
+
+
+def select_into_files(table: TableT, mask: Bool[np.ndarray, " n"], folder: Path) -> TableT:
+    """Return a copy of the rows in a mask, in files in a folder, some thousands copied at a time.
+
+    Raises:
+        DiskFullError: there is no room for the files.
+    """
+    rows = np.flatnonzero(mask)
+    found = allocate_rows(table, len(rows), folder)
+    for start in range(0, len(rows), COPIED_ROWS):
+        part = slice(start, start + COPIED_ROWS)
+        overwrite_rows(found, part, select_rows(table, rows[part]))
+    return found
 
 
 def view_rows(table: TableT, part: slice) -> TableT:

@@ -211,7 +211,9 @@ def run(
         message = "color goes with formats of one color for each Gaussian and is passed over."
         progress(Warned(message))
     count = len(request.files)
-    gaussians = open_scene(request.source, progress)
+    # where a file is to be written there is room for a large scene, too
+    folder = next((path.parent for path in request.files if path.parent.is_dir()), None)
+    gaussians = open_scene(request.source, progress, folder=folder)
     if request.materials:  # materials are what is asked for: what is lost of the harmonics does not matter
         require_materials(gaussians, request.source)
     else:

@@ -32,18 +32,21 @@ MAX_ROUNDING = 0.01
 """Positions that are rounded to more than this share of a Gaussian's size are worth a warning."""
 
 
-def open_scene(path: Path, progress: EventListener, *, drop_invalid: bool = False) -> FlatGaussians:
+def open_scene(
+    path: Path, progress: EventListener, *, drop_invalid: bool = False, folder: Path | None = None
+) -> FlatGaussians:
     """Return the Gaussians of a file of any format or of a run's folder.
 
     Args:
         path: the file or folder.
         progress: receives what reading lost: a warning if it changes the look, else a note.
         drop_invalid: leave out Gaussians with values that are not finite.
+        folder: for files that hold a large scene, see :func:`octasplat.engine.gaussians.flattening.flatten`.
 
     Raises:
         SceneFileError: the file cannot be read.
     """
-    gaussians, report = read_scene(path, drop_invalid=drop_invalid)
+    gaussians, report = read_scene(path, drop_invalid=drop_invalid, folder=folder)
     report_dropped_on_import(path, report, progress)
     if is_run(path) and (left_out := unexported_parts(path)) is not None:
         progress(Warned(left_out))

@@ -63,7 +63,9 @@ def run(
 
     source: Path = request.source
     scene_io.check_edited_output("simplify", request, request.output)
-    gaussians = scene_io.open_scene(source, progress)
+    # where the result is to be written there is room for a large scene, too
+    folder = request.output.parent if request.output.parent.is_dir() else None
+    gaussians = scene_io.open_scene(source, progress, folder=folder)
     count, excess = len(gaussians), len(gaussians) - request.count
 
     def on_round(left: int) -> None:
@@ -71,7 +73,7 @@ def run(
         progress(PhaseProgress("simplify", count - left, excess))
 
     stop_if(should_stop)
-    simplified = simplify(gaussians, request.count, on_round)
+    simplified = simplify(gaussians, request.count, on_round, folder)
     stop_if(should_stop)
     record = scene_io.describe_edit(
         "simplify", options_of(SimplifyOptions, request), gaussians=len(simplified)

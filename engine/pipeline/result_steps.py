@@ -62,7 +62,7 @@ class ExportStep:
 def _export(run: ReconstructionRun, names: list[str]) -> str | None:
     """Write files; return which could not be written, and why."""
     output, progress = run.output, run.progress
-    gaussians, _ = read_gaussian_ply(output / SCENE)
+    gaussians, _ = read_gaussian_ply(output / SCENE, folder=output)
     if (left_out := unexported_parts(output)) is not None:
         progress(Warned(left_out))
     options = ExportOptions(q=run.config.train.trace.q, facts=read_metadata(output))

@@ -1,7 +1,5 @@
 """Depth maps and colors of a scene, rendered by the tracer into a temporary file."""
 
-import os
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -11,8 +9,8 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from octasplat.engine.core.color import to_bytes
+from octasplat.engine.core.file_arrays import new_array
 from octasplat.engine.core.rays import ImageRays
-from octasplat.engine.core.writing import report_disk_full
 from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.render.renderer import RenderedImage, render_rays
 from octasplat.engine.surface.color_fit import Picture
@@ -57,10 +55,7 @@ def render_depth_maps(
         DiskFullError: there is no room for it.
     """
     sizes = [camera.width_px * camera.height_px for camera in cameras]
-    with report_disk_full(folder), tempfile.TemporaryFile(dir=folder) as handle:
-        # Not a file with holes: a full disk would end the program when they are filled.
-        os.posix_fallocate(handle.fileno(), 0, max(12, 12 * sum(sizes)))
-        stored = np.memmap(handle, dtype=np.float32, mode="r+", shape=(3 * sum(sizes),))
+    stored = new_array((3 * sum(sizes),), np.float32, folder)
     distances, cosines, colors, start = [], [], [], 0
     black = np.zeros(3, np.float32)
     progress(0, len(cameras))

@@ -1,15 +1,17 @@
 """Tracer of Gaussians among others that stay as they are."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, Int32
 
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.channels import Channels
+from octasplat.engine.gaussians.flattening import row_slices
 from octasplat.engine.gaussians.merge import with_sh_degree
-from octasplat.engine.gaussians.model import FlatGaussians, concatenate
-from octasplat.engine.gaussians.rows import select_rows
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.rows import allocate_rows, select_rows
 from octasplat.engine.trace.protocol import GaussianGradients, Recording, TraceGradients, Tracer, TraceResult
 
 
@@ -22,10 +24,12 @@ class PartlyFixedTracer:
     Args:
         tracer: traces all of them.
         fixed_gaussians: the fixed Gaussians.
+        folder: for files that hold all Gaussians together; None for memory.
     """
 
-    def __init__(self, tracer: Tracer, fixed_gaussians: FlatGaussians) -> None:
+    def __init__(self, tracer: Tracer, fixed_gaussians: FlatGaussians, folder: Path | None = None) -> None:
         self._tracer = tracer
+        self._folder = folder
         self._fixed_gaussians = replace(fixed_gaussians, channels=Channels())
         self.settings = tracer.settings
         self._gaussians: FlatGaussians | None = None
@@ -35,14 +39,26 @@ class PartlyFixedTracer:
 
     def build(self, gaussians: FlatGaussians, features: Float32[np.ndarray, "n f"] | None = None) -> None:
         """Build the hierarchy of the Gaussians and those around them."""
-        around = with_sh_degree(self._fixed_gaussians, gaussians.sh_degree)
         self._gaussians, self._features = gaussians, features
-        self._all = concatenate([replace(gaussians, channels=Channels()), around])
+        self._all = self._with_fixed(gaussians)
         self._all_features = None
         if features is not None:
-            empty = np.zeros((len(around), features.shape[1]), np.float32)
+            empty = np.zeros((len(self._fixed_gaussians), features.shape[1]), np.float32)
             self._all_features = np.concatenate([features, empty])
         self._tracer.build(self._all, self._all_features)
+
+    def _with_fixed(self, gaussians: FlatGaussians) -> FlatGaussians:
+        """Return the Gaussians with the fixed ones after them, in the arrays of before where these fit."""
+        own = replace(gaussians, channels=Channels())
+        count = len(own)
+        total, found = count + len(self._fixed_gaussians), self._all
+        if found is None or len(found) != total or found.sh_degree != own.sh_degree:
+            found = allocate_rows(own, total, self._folder)
+            for rows in row_slices(total - count):
+                some = with_sh_degree(self._fixed_gaussians.view(rows), own.sh_degree)
+                found.put(slice(count + rows.start, count + rows.stop), some)
+        found.put(slice(0, count), own)
+        return found
 
     def refresh(self, ids: Int32[np.ndarray, " u"] | None = None) -> None:
         """Read the changed parameters of the Gaussians ``ids`` (None: all)."""

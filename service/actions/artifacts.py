@@ -95,5 +95,7 @@ async def get_live_scene(service: Service, principal: Principal, job_id: uuid.UU
     if shown is None:
         raise not_found_error("state of its training")
     if shown.blocks:
-        return await run_in_pool(ThreadPurpose.DOWNLOADS, build_live_scene, service.storage, shown)
+        return await run_in_pool(
+            ThreadPurpose.DOWNLOADS, build_live_scene, service.storage, shown, service.live_rows
+        )
     return await run_in_pool(ThreadPurpose.DOWNLOADS, service.storage.stat, shown.scene.sha256)

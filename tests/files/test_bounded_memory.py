@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from octasplat.engine.files import ExportOptions, dropped_on_export, export_scene, read_scene
+from octasplat.engine.gaussians import flattening
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.rows import row_arrays
 from tests.support.daily import some_daily
@@ -27,6 +28,7 @@ WRITTEN = {
     "a.compressed.ply": ORDER_BYTES,
     "a.glb": ORDER_BYTES + 12,  # a 64th of them at a time
     "a.mesh.ply": 9,  # which have an octagon
+    "tiles/tileset.json": 60,  # the tree of neighbors, and who is the partner of whom; levels are in files
 }
 READ = {
     "a.ply": 1,  # whether each is valid
@@ -87,6 +89,21 @@ def test_reading_takes_no_more_memory_than_the_scene(name: str, tmp_path: Path) 
         found = scene_bytes(read_scene(tmp_path / name)[0])
         beyond.append(peak_bytes(lambda: read_scene(tmp_path / name)) - found)
     assert growth(beyond) <= READ[name] + NOISE_BYTES
+
+
+def test_large_scenes_are_read_into_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, place = tmp_path / "a.ply", tmp_path / "place"
+    place.mkdir()
+    peaks = []
+    for count in COUNTS:
+        export_scene(random_scene(count), path)
+        monkeypatch.setattr(flattening, "MANY_BYTES", scene_bytes(random_scene(count)))
+        peaks.append(peak_bytes(lambda: read_scene(path, folder=place)))
+    assert growth(peaks) <= READ[path.name] + NOISE_BYTES
+    found = read_scene(path, folder=place)[0]
+    for name, array in row_arrays(read_scene(path)[0]).items():
+        np.testing.assert_array_equal(row_arrays(found)[name], array)
+    assert list(place.iterdir()) == []
 
 
 @pytest.mark.exhaustive

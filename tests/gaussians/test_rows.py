@@ -1,10 +1,12 @@
 """What is done to one array of a table is done to all, whatever fields it has."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from octasplat.engine.gaussians import rows
 from octasplat.engine.gaussians.channels import Channels
 from octasplat.engine.gaussians.rows import (
     concatenate_rows,
@@ -49,6 +51,16 @@ def test_rows_are_selected_joined_and_overwritten_together() -> None:
     overwrite_rows(first, np.array([3, 1]), select_rows(second, slice(2)))
     assert_rows(first, [0, 11, 2, 10, 4])
     assert_rows(map_rows(second, lambda array: array[::-1]), [12, 11, 10])
+
+
+def test_rows_are_selected_into_files_without_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rows, "COPIED_ROWS", 2)
+    chosen = rows.select_into_files(table(0, 7), np.array([1, 0, 1, 1, 0, 1, 1], np.bool_), tmp_path)
+    assert_rows(chosen, [0, 2, 3, 5, 6])
+    overwrite_rows(chosen, slice(1, 2), table(10, 1))
+    assert_rows(chosen, [0, 10, 3, 5, 6])
+    assert list(tmp_path.iterdir()) == []
+    assert len(rows.select_into_files(chosen, np.zeros(5, np.bool_), tmp_path).weights) == 0
 
 
 def test_arrays_by_name_and_back() -> None:

@@ -1,6 +1,7 @@
 """Fewer Gaussians that look alike: moments of pairs, and pictures beside those of the largest alone."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +9,8 @@ import pytest
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.frames import frames_from_normals, quaternions_from_matrices
 from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.neighbor_pairs import choose_pairs
+from octasplat.engine.gaussians.rows import row_arrays
 from octasplat.engine.gaussians.simplification import simplify
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import TraceSettings
@@ -80,15 +83,27 @@ def test_opaque_neighbours_keep_their_mass_as_area() -> None:
     assert (outward > 0).all()  # normals stay on their side
 
 
-def test_half_of_a_ball_looks_nearly_like_all_of_it() -> None:
+def test_half_of_a_ball_looks_nearly_like_all_of_it(tmp_path: Path) -> None:
     ball = sphere(6000)
     whole, fewer = picture(ball), simplify(ball, 3000)
     largest = ball.select(np.sort(np.argsort(-ball.opacities * ball.scales.prod(axis=1))[:3000]))
     errors = [np.sqrt(((picture(scene) - whole) ** 2).mean()) for scene in (fewer, largest)]
     assert errors[0] < 0.05 and errors[0] < 0.35 * errors[1]
-    again = simplify(ball, 3000)
-    for name in ("means_world", "quats_wxyz", "log_scales", "opacity_logits", "sh"):
-        np.testing.assert_array_equal(getattr(fewer, name), getattr(again, name))
+    again = simplify(ball, 3000, folder=tmp_path)  # in files without a name
+    for name, array in row_arrays(again).items():
+        np.testing.assert_array_equal(row_arrays(fewer)[name], array)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_of_pairs_that_cost_the_same_the_first_are_chosen() -> None:
+    """A square, whose four sides are alike, and of which two without a common corner are chosen."""
+    square = sphere(4)
+    square.means_world[:] = np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
+    for name, value in (("log_scales", -2), ("opacity_logits", 0), ("sh", 0), ("quats_wxyz", [1, 0, 0, 0])):
+        getattr(square, name)[:] = np.float32(value)
+    square.quats_wxyz[:] = np.float32([0.5**0.5, 0, 0.5**0.5, 0])  # they lie in the square
+    assert [rows.tolist() for rows in choose_pairs(square, 2)] == [[0, 2], [1, 3]]
+    assert [rows.tolist() for rows in choose_pairs(square, 1)] == [[0], [1]]
 
 
 def test_unlike_colors_are_merged_last(make_gaussians: Make) -> None:

@@ -58,6 +58,7 @@ class Trainer:
         camera_clearance: zones around cameras in which no Gaussian stays, whatever the strategy does.
         view_frusta: frusta of the views; no Gaussian stays outside of all of them.
         fixed_gaussians: Gaussians that are seen, too, and stay as they are; not with a tracer that is given.
+        is_fixed_in_files: whether all that is traced, where some are fixed, is in files in ``folder``.
         region: where Gaussians are added first; None for everywhere alike.
         tracer: anything that follows the protocol; None takes the one that the configuration names.
         shading: anything that follows the protocol; None takes the one that the configuration asks for.
@@ -90,6 +91,7 @@ class Trainer:
         camera_clearance: CameraClearance | None = None,
         view_frusta: ViewFrusta | None = None,
         fixed_gaussians: FlatGaussians | None = None,
+        is_fixed_in_files: bool = False,
         region: Region | None = None,
         tracer: Tracer | None = None,
         shading: ShadingModel | None = None,
@@ -97,6 +99,7 @@ class Trainer:
     ) -> None:
         self.state = state
         self._fixed_gaussians = fixed_gaussians
+        self._traced_folder = folder if is_fixed_in_files else None
         self._on_step = on_step
         self._min_scale = min_scale
         self._allowed_region = AllowedRegion(camera_clearance, view_frusta)
@@ -250,7 +253,9 @@ class Trainer:
         sort = "packet" if self.schedule.uses_shared_sort(self.state.iteration) else "ray"
         settings = self._config.trace.model_copy(update={"sort": sort})
         tracer = make_tracer(settings, threads=self._threads, box_padding=self._config.box_padding)
-        return tracer if self._fixed_gaussians is None else PartlyFixedTracer(tracer, self._fixed_gaussians)
+        if self._fixed_gaussians is None:
+            return tracer
+        return PartlyFixedTracer(tracer, self._fixed_gaussians, self._traced_folder)
 
     def _rebuild_bvh(self) -> None:
         """Rebuild the BVH over the current Gaussians, replacing the tracer when the sort mode changes."""
