@@ -32,5 +32,8 @@ def new_array(shape: tuple[int, ...], dtype: DTypeLike, folder: Path | None) -> 
         return np.empty(shape, dtype)
     with report_disk_full(folder), tempfile.TemporaryFile(dir=folder) as handle:
         # Not a file with holes: a full disk would end the program when they are filled.
-        os.posix_fallocate(handle.fileno(), 0, size)
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(handle.fileno(), 0, size)
+        else:  # macOS
+            handle.truncate(size)
         return np.asarray(np.memmap(handle, dtype, "r+", shape=shape))

@@ -1,5 +1,6 @@
 """Flattening of three-dimensional Gaussians of other programs, and its losses."""
 
+import contextlib
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
@@ -9,7 +10,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float32, Int
 
-from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.core.errors import DiskFullError, SceneFileError
 from octasplat.engine.gaussians.channels import Channels, check_row_count
 from octasplat.engine.gaussians.model import FLAT_SCALE, FlatGaussians
 from octasplat.engine.gaussians.rows import (
@@ -246,9 +247,15 @@ _NO_LENGTH = "a rotation of length zero"
 
 
 def _allocate_scene(block: FlatGaussians, count: int, folder: Path | None) -> FlatGaussians:
-    """Return a scene of so many Gaussians like those of a block, not filled yet."""
+    """Return a scene of so many Gaussians like those of a block, not filled yet.
+
+    Files spare memory and are no more than that: where they cannot be made, the scene is in memory.
+    """
     is_large = sum(array[:1].nbytes for array in row_arrays(block).values()) * count >= MANY_BYTES
-    return allocate_rows(block, count, folder if is_large else None)
+    if is_large:
+        with contextlib.suppress(DiskFullError, OSError):
+            return allocate_rows(block, count, folder)
+    return allocate_rows(block, count)
 
 
 def _valid_mask(cloud: GaussianCloud) -> tuple[Bool[np.ndarray, " n"], dict[str, int]]:
