@@ -37,7 +37,7 @@ def test_every_parameter_is_described_and_a_server_is_named() -> None:
     assert nameless == []
     headers = {
         parameter["name"]
-        for item in document["paths"].values()
+        for item in document()["paths"].values()
         for operation in item.values()
         for parameter in operation.get("parameters", ())
         if parameter["in"] == "header"
