@@ -249,11 +249,11 @@ _NO_LENGTH = "a rotation of length zero"
 def _allocate_scene(block: FlatGaussians, count: int, folder: Path | None) -> FlatGaussians:
     """Return a scene of so many Gaussians like those of a block, not filled yet.
 
-    Files spare memory and are no more than that: where they cannot be made, the scene is in memory.
+    Files spare memory and are no more than that: where there is no room for them, the scene is in memory.
     """
     is_large = sum(array[:1].nbytes for array in row_arrays(block).values()) * count >= MANY_BYTES
     if is_large:
-        with contextlib.suppress(DiskFullError, OSError):
+        with contextlib.suppress(DiskFullError):
             return allocate_rows(block, count, folder)
     return allocate_rows(block, count)
 

@@ -29,6 +29,7 @@ _COLUMNS = {"image": "photograph", "im_x": "px", "im_y": "py", "label": "name", 
 _PROJECTED_AMONG_DEGREES = frozenset((*range(4491, 4555), 4647))
 """EPSG codes of projected systems in metres, of CGCS2000 and of Germany, among those that give degrees."""
 _EPSG = re.compile(r"EPSG", re.IGNORECASE)
+_LOCAL = re.compile(r"^local$", re.IGNORECASE)
 _OTHER_SYSTEM = re.compile(r"\bUTM\b|\+proj|\bWGS ?84\b", re.IGNORECASE)
 """What a comment has that says a coordinate system, known or not."""
 _UTM = re.compile(r"WGS ?84 UTM ?(?:zone )?([0-9]{1,2}) ?([NS])", re.IGNORECASE)
@@ -103,8 +104,10 @@ def read_control_file(path: Path) -> ControlFile:
     is_csv = bool(content) and "," in content[0][1] and "name" in _csv_names(content[0][1])
     if is_csv:
         comments = [line.lstrip("# ") for _, line in numbered if line.startswith("#")]
-        # a number comes first; any other system is read or refused, so that its points are not taken as local
-        found = [line for pattern in (_EPSG, _OTHER_SYSTEM) for line in comments if pattern.search(line)]
+        # a number comes first, then a plain "local"; any other system is read or refused, so that its points are
+        # not taken as local
+        patterns = (_EPSG, _LOCAL, _OTHER_SYSTEM)
+        found = [line for pattern in patterns for line in comments if pattern.search(line)]
         stated = next(iter(found), "")
         rows = _csv_rows(path, content)
     else:

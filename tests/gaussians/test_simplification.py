@@ -1,5 +1,7 @@
 """Fewer Gaussians that look alike: moments of pairs, and pictures beside those of the largest alone."""
 
+import errno
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -93,6 +95,23 @@ def test_half_of_a_ball_looks_nearly_like_all_of_it(tmp_path: Path) -> None:
     for name, array in row_arrays(again).items():
         np.testing.assert_array_equal(row_arrays(fewer)[name], array)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("place", ["/proc", "none", "unmapped"])
+def test_without_files_the_result_is_made_in_memory(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ball = sphere(40)
+    expected = row_arrays(simplify(ball, 20))
+    if place == "unmapped":  # as of a shared folder of another machine
+
+        def refuse(*_args: object, **_options: object) -> None:
+            raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
+
+        (tmp_path / place).mkdir()
+        monkeypatch.setattr(np, "memmap", refuse)
+    for name, array in row_arrays(simplify(ball, 20, folder=tmp_path / place)).items():
+        np.testing.assert_array_equal(array, expected[name])
 
 
 def test_of_pairs_that_cost_the_same_the_first_are_chosen() -> None:

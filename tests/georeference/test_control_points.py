@@ -77,6 +77,7 @@ def test_projected_systems_among_the_numbers_of_degrees_are_read(tmp_path: Path,
         ("# +proj=utm +zone=32 +south", "EPSG:32732"),
         ("# WGS84", "EPSG:4979"),
         ("# local metres", None),
+        ("# by tape, not WGS84\n# local", None),
     ],
 )
 def test_comments_of_a_csv_say_the_system(tmp_path: Path, comments: str, crs: str | None) -> None:
