@@ -104,8 +104,8 @@ def read_control_file(path: Path) -> ControlFile:
     is_csv = bool(content) and "," in content[0][1] and "name" in _csv_names(content[0][1])
     if is_csv:
         comments = [line.lstrip("# ") for _, line in numbered if line.startswith("#")]
-        # a number comes first, then a plain "local"; any other system is read or refused, so that its points are
-        # not taken as local
+        # a number comes first, then a plain "local"; any other system is read or refused, so that its points
+        # are not taken as local
         patterns = (_EPSG, _LOCAL, _OTHER_SYSTEM)
         found = [line for pattern in patterns for line in comments if pattern.search(line)]
         stated = next(iter(found), "")

@@ -6,6 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
+from octasplat.engine.core.errors import DiskFullError
 from octasplat.engine.core.events import EventListener, PhaseProgress, ignore_events
 from octasplat.engine.operations.base import (
     Operation,
@@ -73,7 +74,10 @@ def run(
         progress(PhaseProgress("simplify", count - left, excess))
 
     stop_if(should_stop)
-    simplified = simplify(gaussians, request.count, on_round, folder)
+    try:
+        simplified = simplify(gaussians, request.count, on_round, folder)
+    except DiskFullError:  # files spare memory, and the result may be much smaller than what is on the way
+        simplified = simplify(gaussians, request.count, on_round)
     stop_if(should_stop)
     record = scene_io.describe_edit(
         "simplify", options_of(SimplifyOptions, request), gaussians=len(simplified)

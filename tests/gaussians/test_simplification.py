@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from octasplat.engine.core.rays import RayBatch
+from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.engine.gaussians.frames import frames_from_normals, quaternions_from_matrices
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.neighbor_pairs import choose_pairs
 from octasplat.engine.gaussians.rows import row_arrays
 from octasplat.engine.gaussians.simplification import simplify
+from octasplat.engine.operations.simplify import OPERATION, SimplifyRequest
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import TraceSettings
 
@@ -112,6 +114,19 @@ def test_without_files_the_result_is_made_in_memory(
         monkeypatch.setattr(np, "memmap", refuse)
     for name, array in row_arrays(simplify(ball, 20, folder=tmp_path / place)).items():
         np.testing.assert_array_equal(array, expected[name])
+
+
+def test_a_disk_with_room_for_the_result_alone_is_enough(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_gaussian_ply(sphere(40), tmp_path / "ball.ply")
+
+    def refuse(*_args: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", refuse)
+    made = SimplifyRequest(source=tmp_path / "ball.ply", output=tmp_path / "less.ply", count=20)
+    assert OPERATION.run(made).kept == 20
 
 
 def test_of_pairs_that_cost_the_same_the_first_are_chosen() -> None:
