@@ -48,7 +48,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="octasplat-", dir=path.parent) as folder:
         levels: list[Path] = []
-        for level in iterate_levels(scene, MIN_LEVEL_COUNT, Path(folder), MAX_LEVELS):
+        for level in iterate_levels(scene, MIN_LEVEL_COUNT, path.parent, MAX_LEVELS):
             levels.append(Path(folder) / f"level_{len(levels)}.ply")
             write_gaussian_ply(level, levels[-1])
         index = Path(folder) / "packed" / INDEX_FILE

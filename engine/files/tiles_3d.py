@@ -56,7 +56,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
         index = Path(folder) / INDEX_FILE
         (index.parent / CONTENT_FOLDER).mkdir()
         contents: dict[tuple[int, int], TileContent] = {}
-        for finer, level in enumerate(iterate_levels(scene, FEWEST_IN_ROOT, Path(folder))):
+        for finer, level in enumerate(iterate_levels(scene, FEWEST_IN_ROOT, path.parent)):
             at = depth - finer
             numbers = cells.cells_of(level.means_world, at)
             for cell, part in _parts(level, numbers):

@@ -30,7 +30,8 @@ def iterate_levels(
     Args:
         scene: the finest level.
         fewest: Gaussians that a level may have, as in :func:`level_counts`.
-        folder: for files that are gone when nobody holds their level.
+        folder: for files that are gone when nobody holds their level. It must outlast the levels: of a file
+            that is held something stays in its folder on NFS, so that this cannot be removed.
         most: levels, None for all that there are.
 
     Raises:

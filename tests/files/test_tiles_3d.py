@@ -1,6 +1,7 @@
 """3D Tiles: the tree, what its tiles hold, and where they stand."""
 
 import json
+import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -224,6 +225,23 @@ def test_same_scene_gives_the_same_bytes(scene: FlatGaussians, tmp_path: Path) -
     assert [path.name for path in first] == [path.name for path in second]
     for one, other in zip(first, second, strict=True):
         assert one.read_bytes() == other.read_bytes()
+
+
+def test_levels_in_files_are_not_in_what_is_removed_before_them(
+    scene: FlatGaussians, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """NFS keeps something in the folder of a file that is held, so that the folder cannot be removed."""
+    held: list[str] = []
+    remove = tempfile.TemporaryDirectory.cleanup
+
+    def look_and_remove(folder: tempfile.TemporaryDirectory[str]) -> None:
+        maps = Path("/proc/self/maps").read_text().splitlines()
+        held.extend(line for line in maps if f"{folder.name}/" in line)
+        remove(folder)
+
+    monkeypatch.setattr(tempfile.TemporaryDirectory, "cleanup", look_and_remove)
+    export_scene(scene, tmp_path / "out" / "tileset.json")
+    assert held == []
 
 
 def test_gaussians_in_one_place_are_written(tmp_path: Path) -> None:

@@ -58,7 +58,8 @@ class Trainer:
         camera_clearance: zones around cameras in which no Gaussian stays, whatever the strategy does.
         view_frusta: frusta of the views; no Gaussian stays outside of all of them.
         fixed_gaussians: Gaussians that are seen, too, and stay as they are; not with a tracer that is given.
-        is_fixed_in_files: whether all that is traced, where some are fixed, is in files in ``folder``.
+        is_fixed_in_files: whether all that is traced, where some are fixed, is in files beside ``folder``,
+            which may be removed before them.
         region: where Gaussians are added first; None for everywhere alike.
         tracer: anything that follows the protocol; None takes the one that the configuration names.
         shading: anything that follows the protocol; None takes the one that the configuration asks for.
@@ -99,7 +100,7 @@ class Trainer:
     ) -> None:
         self.state = state
         self._fixed_gaussians = fixed_gaussians
-        self._traced_folder = folder if is_fixed_in_files else None
+        self._traced_folder = folder.parent if is_fixed_in_files else None
         self._on_step = on_step
         self._min_scale = min_scale
         self._allowed_region = AllowedRegion(camera_clearance, view_frusta)
