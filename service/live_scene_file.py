@@ -66,12 +66,6 @@ class KeptRows:
                 self._bytes -= len(self._rows.popitem(last=False)[1].data)
         return found
 
-    def clear(self) -> None:
-        """Let go all rows."""
-        with self._lock:
-            self._rows.clear()
-            self._bytes = 0
-
 
 def build_live_scene(storage: Storage, shown: ShownScene, kept: KeptRows) -> bytes:
     """Return the PLY file of what is shown.

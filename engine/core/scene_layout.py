@@ -119,10 +119,10 @@ def lay_out_scene(paths: Sequence[str]) -> SceneLayout:
     folder = common_folder(rest)
     names = {path: path.removeprefix(folder) for path in rest}
     results = results_folders(names.values())
-    photographs = {name: None for name in names.values() if is_photograph(name, results)}
+    photographs = {name for name in names.values() if is_photograph(name, results)}
     top = next((top for top in (IMAGES, "input/") if any(name.startswith(top) for name in photographs)), "")
     if not top and is_results_folder(names.values()):
-        photographs = {}
+        photographs = set()
     unused = _unused_model_files(names.values())
     files: dict[str, str] = {}
     for path, name in names.items():

@@ -11,6 +11,7 @@ import pytest
 
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.service.live_scene_file import KeptRows
 from octasplat.service.state import Service
 from octasplat.workers.db.live_scenes import LiveScene
 from octasplat.workers.queue.attempts import Attempt
@@ -188,7 +189,7 @@ async def test_lost_coarse_scene_leaves_what_blocks_have_learnt(
         np.testing.assert_array_equal(await shown(http, job, folder), LEARNT[1])
         service.storage.delete(digests[1])
         np.testing.assert_array_equal(await shown(http, job, folder), LEARNT[1])  # kept since it was read
-        service.live_rows.clear()
+        service.live_rows = KeptRows()
         assert (await http.get(address)).status_code == 410
         assert (await http.get(f"/jobs/{job['id']}")).status_code == 200
         await second.succeed([], job_queue=service.job_queue)
