@@ -84,6 +84,10 @@ _ROLES_BY_FOLDER = {
 }
 
 
+RUN_FILES = frozenset({"config.json", "events.jsonl"})
+"""At the top of the folder of a run."""
+
+
 @dataclass(frozen=True)
 class SceneLayout:
     """Files that belong to a dataset, among others.
@@ -165,7 +169,7 @@ def results_folders(names: Iterable[str]) -> tuple[str, ...]:
 
 def is_results_folder(names: Iterable[str]) -> bool:
     """Return whether a folder with these files is that of a run, whose renders are no photographs."""
-    return {"config.json", "events.jsonl"} <= set(names)
+    return set(names) >= RUN_FILES
 
 
 def file_role(name: str) -> FileRole:

@@ -2,7 +2,9 @@
 
 from pathlib import Path
 
+from octasplat.engine.core.scene_layout import RUN_FILES
+
 
 def is_run_folder(folder: Path) -> bool:
     """Return whether a folder is a run folder, whose renders and layers are not photographs."""
-    return (folder / "config.json").is_file() and (folder / "events.jsonl").is_file()
+    return all((folder / name).is_file() for name in RUN_FILES)
