@@ -115,6 +115,8 @@ class TrainConfig(PhotographSettings, GaussianSettings, RaySettings):
             raise ValueError(
                 "loss.depth_normal compares neighbouring rays of windows: set ray_patch_rays to 64"
             )
+        if self.loss.edges > 0 and not self.materials.learn:
+            raise ValueError("loss.edges is for trainings with materials: set it to 0")
         if self.trace.sort != "ray":
             raise ValueError(
                 "trace.sort is the training's own; shared_sort_until says for which share it is packet"

@@ -21,6 +21,7 @@ from octasplat.engine.train.config import LearningRates, LossWeights
 from octasplat.engine.train.densify import Densifier
 from octasplat.engine.train.loop.state import TrainState
 from octasplat.engine.train.optimization.depth_loss import add_depth_gradient
+from octasplat.engine.train.optimization.edge_loss import edge_gradient
 from octasplat.engine.train.optimization.losses import BatchLoss, batch_loss, ray_errors
 from octasplat.engine.train.sampling.batches import Batch
 from octasplat.engine.train.sampling.visibility_rays import free_space_gradient
@@ -95,6 +96,8 @@ def loss_and_gradients(
     recorded = [(result.recording, grad_trace), *grad_shading.recorded_traces]
     if batch.visibility_rays is not None:
         recorded.append(free_space_gradient(batch.visibility_rays, tracer, weights.free_space))
+    if batch.edge_batch is not None:
+        recorded.append(edge_gradient(batch.edge_batch, tracer, weights))
     # What several recordings say has to be added up first.
     min_trace_weight = min_blend_weight if len(recorded) == 1 else 0.0
     gradients = [

@@ -2,7 +2,7 @@
 
 import math
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -39,7 +39,7 @@ class Batch:
     ``ray_patches`` says which of the others form patches. ``background_srgb`` lies
     behind both the Gaussians and photographs with alpha. ``visibility_rays`` end before points that views
     show. ``known_distances`` are those of the surface along the rays by depth maps, world units, 0 where
-    unknown.
+    unknown. ``edge_batch`` has further rays, for the term of the loss for edges.
     """
 
     rays: RayBatch
@@ -53,6 +53,7 @@ class Batch:
     visibility_rays: RayBatch | None = None
     ray_patches: RayPatches | None = None
     known_distances: Float32[np.ndarray, " r"] | None = None
+    edge_batch: "Batch | None" = None
 
     @cached_property
     def target_srgb(self) -> Float32[np.ndarray, "r 3"]:
@@ -75,6 +76,7 @@ class BatchOptions:
         visibility_ray_fraction: visibility rays beside each batch, of its rays; 0 where the loss has no term
             for them.
         reads_depths: whether the loss has a term for depth maps.
+        has_edge_rays: whether the loss has a term for edges.
     """
 
     rays_per_batch: int
@@ -85,6 +87,7 @@ class BatchOptions:
     ssim_patch_side_px: int
     visibility_ray_fraction: float
     reads_depths: bool = False
+    has_edge_rays: bool = False
 
     @classmethod
     def from_config(cls, config: TrainConfig, dataset: TrainingData) -> "BatchOptions":
@@ -105,6 +108,7 @@ class BatchOptions:
             ssim_patch_side_px=config.ssim_patch_side,
             visibility_ray_fraction=config.visibility_ray_fraction if config.loss.free_space > 0 else 0.0,
             reads_depths=bool(config.loss.depth),
+            has_edge_rays=config.loss.edges > 0 and config.materials.learn,
         )
 
 
@@ -151,6 +155,13 @@ class BatchSource:
 
     def draw(self, rng: np.random.Generator, index: int = 0) -> Batch:
         """Draw the next batch, after ``index`` others."""
+        batch = self._draw(rng, index)
+        if not self._options.has_edge_rays:
+            return batch
+        # counted backwards, so that they look elsewhere than the batch itself
+        return replace(batch, edge_batch=self._draw(rng, -1 - index))
+
+    def _draw(self, rng: np.random.Generator, index: int) -> Batch:
         options, sampler, side = self._options, self.sampler, self._options.ssim_patch_side_px
         free_count = options.rays_per_batch - self._ssim_patches * side**2
         patch_count = free_count // options.ray_patch_rays if options.ray_patch_rays > 1 else 0

@@ -1,0 +1,45 @@
+"""The term of the loss for edges in trainings with materials, by its gradients alone.
+
+With its reflected rays a ray with materials takes several times as long as one that shows harmonics. So a
+training with materials sees each pixel a few times only, and thin parts and outlines are not where they belong
+when it ends. Harmonics tell these apart as well. So further rays show harmonics, and where they pass an edge
+the difference from the photographs moves the Gaussians. Elsewhere it does not: harmonics explain reflections
+by Gaussians behind the surface.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float32
+
+from octasplat.engine.trace.protocol import Recording, TraceGradients, Tracer, TraceResult
+from octasplat.engine.train.config import LossWeights
+from octasplat.engine.train.optimization.losses import pixel_loss
+from octasplat.engine.train.sampling.batches import Batch
+
+MIN_DEPTH_DIFFERENCE = 0.01
+"""Between mean and median depth, of the latter, from which on a ray passes an edge."""
+CLEAR_TRANSMITTANCE = (0.02, 0.98)
+"""Between these a ray meets a thing in part."""
+
+
+def passes_edge(result: TraceResult) -> Bool[np.ndarray, " r"]:
+    """Return which rays pass an edge: of a thing before nothing, or of one surface before another."""
+    difference = np.abs(result.expected_depth - result.depth_median)
+    least, most = CLEAR_TRANSMITTANCE
+    is_partly_met = (result.transmittance > least) & (result.transmittance < most)
+    return np.asarray(is_partly_met | (difference > MIN_DEPTH_DIFFERENCE * result.depth_median))
+
+
+def edge_gradient(batch: Batch, tracer: Tracer, weights: LossWeights) -> tuple[Recording, TraceGradients]:
+    """Return the recording of rays that show harmonics, and gradients of their loss where they pass an edge.
+
+    The loss is ``weights.edges`` times that of :func:`pixel_loss` over the whole batch, of which rays that
+    pass no edge leave out their part.
+    """
+    result = tracer.trace(batch.rays, record=True)
+    assert result.recording is not None
+    background = batch.background_srgb
+    render = result.rgb_srgb + result.transmittance[:, None] * background
+    loss = pixel_loss(render, batch.target_srgb, batch.weight, l1=weights.l1, l2=weights.l2)
+    chosen = np.float32(weights.edges) * passes_edge(result).astype(np.float32)
+    by_color: Float32[np.ndarray, "r 3"] = loss.gradient * chosen[:, None]
+    return result.recording, TraceGradients(by_color, transmittance=by_color @ background)
