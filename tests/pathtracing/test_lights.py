@@ -54,6 +54,9 @@ def test_rectangle_light_back_side_is_black() -> None:
 def test_points_fall_off_with_the_square_and_directional_lights_not() -> None:
     point = build_light_arrays((PointLight(position=(0, 0, 2), intensity=8.0),), UP)
     sun = build_light_arrays((DirectionalLight(direction=(1, 0, -1), irradiance=2.0),), UP)
+    # A ball that is far and small, as a sun given by its place, lights as a point does.
+    ball = build_light_arrays((PointLight(position=(0, 0, 2e7), intensity=8e14, radius=2.0),), UP)
+    np.testing.assert_allclose(irradiance(sample_lights(ball, np.zeros((4, 3)), stratified(2))), 2.0)
     np.testing.assert_allclose(irradiance(sample_lights(point, np.zeros((4, 3)), stratified(2))), 2.0)
     np.testing.assert_allclose(
         irradiance(sample_lights(sun, np.full((4, 3), 9.0), stratified(2))), np.sqrt(2)
