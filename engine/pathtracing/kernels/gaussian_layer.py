@@ -223,6 +223,7 @@ def intersect_gaussian_layers(
             first_pair = CAMERA_SAMPLE_PAIRS + depth * SAMPLE_PAIRS_PER_BOUNCE
             normal = layer.normals[k, 0], layer.normals[k, 1], layer.normals[k, 2]
             query = LightQuery(lights, integrator, shadows, k)
+            shadows.medium_ids[k] = paths.medium_ids[p]
             if scene.any_nested:
                 copy_media(paths.media[p], shadows.media[k])
             _query_layer_light(paths, p, first_pair, point, normal, (g_r, g_g, g_b), shares, query)
