@@ -308,3 +308,46 @@ def test_unsupported_material_feature_warns(tmp_path: Path) -> None:
     said: list[str] = []
     compile_meshes(Stage(meshes=(StageMesh(file="a.glb"),)), tmp_path, warn=said.append)
     assert said == ["a.glb: of the material cloth is not used: KHR_materials_sheen, alphaMode DITHER."]
+
+
+@pytest.mark.parametrize(
+    ("material", "reach", "told"),
+    [
+        (
+            {"emissiveFactor": [1, 0, 0], "pbrMetallicRoughness": {"metallicRoughnessTexture": {"index": 0}}},
+            1,
+            "texture of metallic and roughness on glass, light of its own of glass",
+        ),
+        ({"pbrMetallicRoughness": {"metallicFactor": 0.25}}, 1, "metallic 0.25 of glass"),
+        ({"pbrMetallicRoughness": {"metallicFactor": 0.0}}, 1, None),
+        (
+            {"normalTexture": {"index": 0, "scale": -1}, "extensions": {}},
+            1,
+            "the sign of the scale of its normal texture",
+        ),
+        ({"normalTexture": {"index": 0}, "extensions": {}}, 1, None),
+        (
+            {"normalTexture": {"index": 0}, "extensions": {}},
+            2,
+            "images that are mirrored or end at their edges, as texture coordinates go beyond",
+        ),
+    ],
+    ids=["glowing-glass", "metal", "plain-glass", "sunken", "within-image", "beyond-image"],
+)
+def test_what_a_glb_says_in_vain_is_told(
+    tmp_path: Path, material: dict[str, Any], reach: int, told: str | None
+) -> None:
+    glass = {"KHR_materials_transmission": {"transmissionFactor": 1.0}}
+    cube = primitive_shape("cube")
+    assert cube.corner_uv is not None
+    more = {"textures": [{"source": 0, "sampler": 0}], "samplers": [{"wrapS": 33648}]}
+    write_glb(
+        tmp_path / "a.glb",
+        replace(cube, corner_uv=reach * cube.corner_uv),
+        [{"name": "m", "extensions": glass} | material],
+        [checks(tmp_path / "a.png", 0)],
+        more=more,
+    )
+    said: list[str] = []
+    compile_meshes(Stage(meshes=(StageMesh(file="a.glb"),)), tmp_path, warn=said.append)
+    assert said == ([] if told is None else [f"a.glb: of the material m is not used: {told}."])
