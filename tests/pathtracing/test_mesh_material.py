@@ -215,15 +215,23 @@ def test_glb_materials_in_mirrored_node(tmp_path: Path) -> None:
 def test_obj_materials_are_read_from_mtl(tmp_path: Path) -> None:
     cube = welded(primitive_shape("cube"))
     checks(tmp_path / "wood bark.png", 1)
+    checks(tmp_path / "bumps.png", 2, 0.3)
     (tmp_path / "things.mtl").write_text(
         "newmtl wood\nKd 0.5 0.5 0.5\nmap_Kd -s 1 1 1 C:\\art\\wood bark.png\nPr 0.4\nPm 0.0\n"
+        "norm -bm 0.3 -o 0 0.5 -clamp on -texres 64 bumps.png\n"
         "Pc 0.5\nPcr 0.2\n"
         "newmtl lamp\nKd 0 0 0\nKe 2 2 2\n"
     )
     write_obj(tmp_path / "twin.obj", cube)
     write_obj(tmp_path / "a.obj", cube, "mtllib things.mtl\nusemtl wood")
-    wood = MetallicRoughness(texture="wood bark.png", roughness=0.4, clear_coat=0.5, clear_coat_roughness=0.2)
+    wood = MetallicRoughness(
+        texture="wood bark.png", roughness=0.4, clear_coat=0.5, clear_coat_roughness=0.2,
+        normal_texture="bumps.png", normal_scale=0.3,
+    )  # fmt: skip
     same_as(tmp_path, "a.obj", wood)
+    said: list[str] = []
+    compile_meshes(Stage(meshes=(StageMesh(file="a.obj"),)), tmp_path, warn=said.append)
+    assert len(said) == 1 and "is not used: -o of norm, -clamp of norm, a clear coat" in said[0]
     text = (tmp_path / "a.obj").read_text().splitlines()
     text.insert(-6, "usemtl lamp")
     (tmp_path / "b.obj").write_text("\n".join(text) + "\n")
