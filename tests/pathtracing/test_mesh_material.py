@@ -121,6 +121,15 @@ def same_as(folder: Path, file: str, material: Material, twin: str = "twin.obj")
     return found
 
 
+def test_ball_texture_goes_round_it_without_a_twist_at_the_poles() -> None:
+    ball = primitive_shape("sphere")
+    assert ball.corner_uv is not None
+    x, y, z = ball.vertices[ball.faces].mean(axis=1).T
+    u, v = ball.corner_uv.mean(axis=1).T
+    off = (u - (0.5 + np.arctan2(x, z) / (2 * np.pi)) + 0.5) % 1 - 0.5
+    assert np.abs(off).max() < 0.01 and np.abs(v - np.arctan2(np.hypot(x, z), y) / np.pi).max() < 0.01
+
+
 def test_glb_material_and_textures_are_read(tmp_path: Path) -> None:
     cube = primitive_shape("cube")
     names = ("texture", "metallic_roughness_texture", "normal_texture", "emission_texture")
