@@ -9,7 +9,12 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from octasplat.engine.core.events import EventListener, Warned, ignore_events
 from octasplat.engine.operations.base import Operation, Result, never_stop
-from octasplat.engine.operations.render_options import PictureOptions, PictureRequest, check_layers
+from octasplat.engine.operations.render_options import (
+    UP_OF_RUN_UNUSED,
+    PictureOptions,
+    PictureRequest,
+    check_layers,
+)
 from octasplat.engine.pathtracing.stage.model import Stage
 from octasplat.engine.pathtracing.stage.stage_file import read_stage, referenced_files, toml_complaint
 from octasplat.engine.pathtracing.stage.text_bounds import check_stage_text
@@ -214,6 +219,8 @@ def run(
         # a stage says itself how Gaussians are lit
         shading=request.shading if request.stage is None else "harmonics",
     )
+    if request.up is not None and source.viewpoints is not None:
+        report(Warned(UP_OF_RUN_UNUSED))
     cameras = requested_cameras(request, source)
     shots = requested_views(request, source) if cameras is None else camera_shots(cameras)
     written = shots[:1] if request.preview else shots

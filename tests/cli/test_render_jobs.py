@@ -184,8 +184,9 @@ def test_relight_job_and_command_of_one_request_give_the_same_bytes(
 
 
 def test_stage_init_job_matches_command(run, octasplat, tmp_path):
-    done = octasplat("stage", "init", run.output, "-o", tmp_path / "stage.toml")
+    done = octasplat("stage", "init", run.output, "--up", "x", "-o", tmp_path / "stage.toml")
     assert done.exit_code == 0 and "up is" in done.output, done.output
+    assert "(up) goes with a file" in done.stderr
     results = results_of("stage-init", run.output, tmp_path / "attempt", {})
     assert contents(results) == {"stage.toml": (tmp_path / "stage.toml").read_bytes()}
 
@@ -318,8 +319,9 @@ def test_numbered_images_are_gone_on_with_for_the_same_views_only(run, octasplat
 
 def test_options_without_effect_on_cameras_are_warned_of(run, octasplat, tmp_path):
     one = ("--turntable", "--frames", 1, *SIZE_WORDS)
-    done = octasplat("render", run.output, *one, "--max-side", 16, "--fps", 5, "-o", tmp_path / "one.png")
-    assert done.exit_code == 0, done.output
+    vain = ("--max-side", 16, "--fps", 5, "--up", "x")
+    done = octasplat("render", run.output, *one, *vain, "-o", tmp_path / "one.png")
+    assert done.exit_code == 0 and "(up) goes with a file" in done.stderr, done.output
     assert "(max_side) goes with views of photographs" in done.stderr and "(fps) goes with" in done.stderr
     done = octasplat("render", run.output, "--views", "held-out", "--fov", 20, "-o", tmp_path / "views")
     assert done.exit_code == 0 and "(fov_y_degrees) goes with" in done.stderr, done.output
