@@ -276,6 +276,7 @@ def _render_on_stage(plan: _RenderPlan, progress: EventListener, threads: int) -
     request, source, cameras, shots, output = plan
     from octasplat.engine.operations.render_source import stage_scene
     from octasplat.engine.pathtracing.stage.stage_file import stage_identity
+    from octasplat.engine.pathtracing.stage_motion import is_moving
     from octasplat.engine.pathtracing.stage_rendering import compile_stage
     from octasplat.engine.render.render_digest import render_digest
     from octasplat.engine.render.renderer import background_color
@@ -294,7 +295,8 @@ def _render_on_stage(plan: _RenderPlan, progress: EventListener, threads: int) -
     finished = output.finished_images(
         render_digest(
             source.gaussians, source.settings, background, False, cameras,
-            stage_identity(stage, request.stage_folder), views, scene.photographs, *output.numbered(shots),
+            stage_identity(stage, request.stage_folder), views, scene.photographs,
+            *output.numbered(shots, counts=is_moving(stage) and cameras is None),
         )
     )  # fmt: skip
     return output.write(shots, compile_stage(stage, scene, shots).render_fn, finished, progress)
