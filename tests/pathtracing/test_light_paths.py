@@ -209,7 +209,7 @@ def test_light_of_a_point_goes_straight_through_a_pane(tmp_path: Path) -> None:
 
 
 def absorbing(height: float, half: float) -> StageMesh:
-    """A slab of index 1 that absorbs a tenth of a power of e per unit, its middle at a height over the floor."""
+    """A slab of index 1 that absorbs, its middle at a height over the floor."""
     material = Glass(ior=1.0, absorption=(0.1, 0.1, 0.1))
     return StageMesh(shape="cube", position=(0, -height, 0), scale=(8, half, 8), material=material)
 
