@@ -53,6 +53,8 @@ def import_material(
         raise ConfigError(f"the material {source.name} holds a number that is negative or not finite.")
     left_out = list(source.unsupported)
     ior = min(source.ior, MAX_IOR) if source.ior >= 1.0 else 1.5
+    if ior != source.ior:
+        left_out.append(f"an index of refraction of {source.ior:g} ({ior:g} is taken)")
     material: Material
     if source.transmission >= 0.5:
         named = {

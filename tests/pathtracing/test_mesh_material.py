@@ -338,6 +338,11 @@ def test_unsupported_material_feature_warns(tmp_path: Path) -> None:
         ({"pbrMetallicRoughness": {"metallicFactor": 0.25}}, 1, "metallic 0.25 of glass"),
         ({"pbrMetallicRoughness": {"metallicFactor": 0.0}}, 1, None),
         (
+            {"extensions": {"KHR_materials_ior": {"ior": 5}}},
+            1,
+            "an index of refraction of 5 (4 is taken)",
+        ),
+        (
             {"normalTexture": {"index": 0, "scale": -1}, "extensions": {}},
             1,
             "the sign of the scale of its normal texture",
@@ -349,7 +354,7 @@ def test_unsupported_material_feature_warns(tmp_path: Path) -> None:
             "images that are mirrored or end at their edges, as texture coordinates go beyond",
         ),
     ],
-    ids=["glowing-glass", "metal", "plain-glass", "sunken", "within-image", "beyond-image"],
+    ids=["glowing-glass", "metal", "plain-glass", "dense", "sunken", "within-image", "beyond-image"],
 )
 def test_what_a_glb_says_in_vain_is_told(
     tmp_path: Path, material: dict[str, Any], reach: int, told: str | None
