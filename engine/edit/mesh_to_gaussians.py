@@ -61,9 +61,14 @@ def recover_gaussians(
         options: see there.
 
     Raises:
-        SceneFileError: the mesh does not belong to the scene, its vertices cannot be identified, or nothing
-            is left of the scene.
+        SceneFileError: the mesh does not belong to the scene, is only a part of it, its vertices cannot be
+            identified, or nothing is left of the scene.
     """
+    if mesh.part is not None:  # what lies in the others would count as deleted
+        raise SceneFileError(
+            f"{path}: is part {mesh.part[0]} of the {mesh.part[1]} files of its scene; export it as PLY to "
+            "edit it, or join all parts in the editor."
+        )
     options = options or MeshToGaussiansOptions()
     opacities = gaussians.opacities
     q, radii = exported_radii(mesh, opacities, options.q)

@@ -161,6 +161,7 @@ def _read_triangles(file: GlbFile, *, with_materials: bool) -> tuple[ImportedMes
         min_opacity=numbers_stated.get(MIN_OPACITY_KEY),
         scene_size=scene_size_of(stated.get(SCENE_SIZE_KEY)),
         alpha_cutoff=numbers_stated.get(ALPHA_CUTOFF_KEY),
+        part=glb_container.stated_part(file.document),
         normals=joined.get("normal"),
         rgb_linear=joined.get("color"),
         alpha=_flatten_scalar(joined.get("alpha")),

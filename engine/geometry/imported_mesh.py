@@ -26,6 +26,7 @@ class ImportedMesh:
         min_opacity: octagons were made of Gaussians at least this opaque, where the file still says so.
         scene_size: number of Gaussians of the exported scene, where the file still says so.
         alpha_cutoff: octagons were made no larger than what reaches this alpha, where the file still says so.
+        part: place of the file among those of its scene, from 1, and their number, where it is one of several.
         rounding: how far a coordinate may be off because of the digits that the file keeps, beyond float32.
         corner_uv: of a mesh read with its looks: texture coordinates of the triangles' corners, (0, 0) at the
             upper left, NaN where there are none; None without any.
@@ -46,6 +47,7 @@ class ImportedMesh:
     min_opacity: float | None = None
     scene_size: int | None = None
     alpha_cutoff: float | None = None
+    part: tuple[int, int] | None = None
     rounding: float = 0.0
     corner_uv: Float32[np.ndarray, "t 3 2"] | None = None
     normals: Float32[np.ndarray, "v 3"] | None = None
