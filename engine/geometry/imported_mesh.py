@@ -25,8 +25,8 @@ class ImportedMesh:
         q: chi-square quantile of the octagons, where the file still names it.
         min_opacity: octagons were made of Gaussians at least this opaque, where the file still says so.
         scene_size: number of Gaussians of the exported scene, where the file still says so.
-        alpha_cutoff: octagons were made no larger than what reaches this alpha, where the file still says so.
-        part: place of the file among those of its scene, from 1, and their number, where it is one of several.
+        alpha_cutoff: octagons were made no larger than what reaches this alpha, where the file still says it.
+        part: place of the file among those of its scene, from 1, and their number; None if it is alone.
         rounding: how far a coordinate may be off because of the digits that the file keeps, beyond float32.
         corner_uv: of a mesh read with its looks: texture coordinates of the triangles' corners, (0, 0) at the
             upper left, NaN where there are none; None without any.
