@@ -248,6 +248,7 @@ def measure_run(
         environment=environment,
         relighter=relighter,
         check=check,
+        are_held_out=into is None,
     )
 
 
