@@ -358,11 +358,10 @@ def part_extras(part: int, count: int) -> dict[str, object]:
 
 def stated_part(document: Mapping[str, Any]) -> tuple[int, int] | None:
     """Return the place of a file among those of its scene, from 1, and their number; None if it is alone."""
-    stated = document.get("asset", {}).get("extras", {}).get(PART_KEY)
-    if stated is None:
-        return None
-    part, count = (int(number) for number in stated)
-    return (part, count) if count > 1 else None
+    match document.get("asset", {}).get("extras", {}).get(PART_KEY):
+        case [int(part), int(count)] if count > 1:
+            return part, count
+    return None
 
 
 def part_note(document: Mapping[str, Any]) -> tuple[str, ...]:
