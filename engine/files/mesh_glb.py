@@ -45,6 +45,7 @@ from octasplat.engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS, ha
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import SIDES, octagon_triangles
 from octasplat.engine.geometry.imported_mesh import (
+    ALPHA_CUTOFF_KEY,
     MIN_OPACITY_KEY,
     Q_KEY,
     SCENE_SIZE_KEY,
@@ -151,7 +152,7 @@ def _read_triangles(file: GlbFile, *, with_materials: bool) -> tuple[ImportedMes
     stated = file.document.get("asset", {}).get("extras", {})
     numbers_stated = {
         key: float(value)
-        for key in (Q_KEY, MIN_OPACITY_KEY)
+        for key in (Q_KEY, MIN_OPACITY_KEY, ALPHA_CUTOFF_KEY)
         if isinstance(value := stated.get(key), int | float)
     }
     mesh = ImportedMesh(
@@ -164,6 +165,8 @@ def _read_triangles(file: GlbFile, *, with_materials: bool) -> tuple[ImportedMes
         q=numbers_stated.get(Q_KEY),
         min_opacity=numbers_stated.get(MIN_OPACITY_KEY),
         scene_size=scene_size_of(stated.get(SCENE_SIZE_KEY)),
+        alpha_cutoff=numbers_stated.get(ALPHA_CUTOFF_KEY),
+        part=glb_container.stated_part(file.document),
         normals=joined.get("normal"),
         rgb_linear=joined.get("color"),
         alpha=_flatten_scalar(joined.get("alpha")),
@@ -260,7 +263,7 @@ def _file_extras(soup: OctagonSoup, options: ExportOptions, parts: int) -> list[
         SCENE_SIZE_KEY: soup.scene_size,
     }
     if options.opaque:
-        extras["octasplat_opaque_cutoff"] = OPAQUE_CUTOFF
+        extras[ALPHA_CUTOFF_KEY] = OPAQUE_CUTOFF
     extras |= glb_container.channel_extras(soup.channel_widths)
     return [extras | glb_container.part_extras(part, parts) for part in range(1, parts + 1)]
 
