@@ -53,7 +53,7 @@ def one_run(root: Path) -> dict[str, Any]:
     data, port = root / "data", str(free_port())
     for name in ("serve_from_nothing_s", "serve_again_s"):
         began = time.monotonic()
-        process = start("workers", "serve", "--data", str(data), "--port", port)
+        process = start("octasplat", "serve", "--data", str(data), "--port", port)
         found[name] = ready_after(began, int(port), process)
         process.terminate()
         process.wait(60)
@@ -62,7 +62,7 @@ def one_run(root: Path) -> dict[str, Any]:
     try:
         began = time.monotonic()
         given = {"DATABASE_URL": database.conninfo(), "OCTASPLAT_DATA": str(data), "OCTASPLAT_PORT": port}
-        process = start("service", **given)
+        process = start("octasplat", "api", **given)
         found["front_end_s"] = ready_after(began, int(port), process)
         memory = psutil.Process(process.pid).memory_full_info()
         found["front_end_rss_mb"] = round(memory.rss / 1e6, 1)

@@ -202,6 +202,18 @@ def test_former_flags_are_taken_and_only_new_ones_are_in_the_help(
         assert getattr(taken[former], "hidden", False) and not getattr(taken[new], "hidden", True)
 
 
+def test_former_flag_beside_its_new_one_is_refused(tmp_path: Path) -> None:
+    rays = ["--rays", "512", "--rays-per-batch", "1024"]
+    both = ["--on", str(tmp_path), "--other-dataset", str(tmp_path)]
+    for arguments, sentence in (
+        (["reconstruct", str(tmp_path), "-o", str(tmp_path / "out"), *rays], "--rays is the former name of"),
+        (["evaluate", str(tmp_path), *both], "--on is the former name of --other-dataset"),
+        (["derive", "evaluate", "last", *both], "--on is the former name of --other-dataset"),
+    ):
+        done = CliRunner().invoke(cli, arguments)
+        assert done.exit_code == 2 and sentence in done.stderr, done.stderr
+
+
 def _models(model: type[BaseModel]) -> list[type[BaseModel]]:
     inner = (type(getattr(model(), name)) for name in model.model_fields)
     return [model, *(part for kind in inner if issubclass(kind, BaseModel) for part in _models(kind))]

@@ -123,7 +123,11 @@ def origin_after(
     centre = np.median(moved, axis=0)
     extent = float(np.median(np.linalg.norm(moved - centre, axis=1)))
     chosen = choose_origin(centre + carried, extent)
-    if is_set(chosen) and is_set(origin) and np.linalg.norm(centre) <= MAX_DISTANCE * extent:
+    if extent == 0.0:  # of points in one place nothing says whether their coordinates are large
+        is_far = is_set(origin) and np.linalg.norm(carried) > MAX_DISTANCE * np.linalg.norm(centre)
+    else:
+        is_far = is_set(chosen) and is_set(origin) and np.linalg.norm(centre) <= MAX_DISTANCE * extent
+    if is_far:
         x, y, z = carried.tolist()
         return (x, y, z)  # points keep their local coordinates
     return chosen

@@ -223,7 +223,13 @@ class ViewsRecord(_FrozenModel):
         shared = [(view, others[name]) for view, name in names if name in others]
         return 2 * sum(self._stands_elsewhere(one, two) for one, two in shared) > len(shared)
 
-    def _stands_elsewhere(self, one: _ViewEntry, two: _ViewEntry) -> bool:
+    def has_other_poses(self, views: Sequence[PosedView]) -> bool:
+        """Return whether most of the views of the same names, about the same origin, have other poses."""
+        mine = {view.name: view for view in self.views}
+        shared = [(mine[view.name], view) for view in views if view.name in mine]
+        return 2 * sum(self._stands_elsewhere(one, two) for one, two in shared) > len(shared)
+
+    def _stands_elsewhere(self, one: _ViewEntry, two: _ViewEntry | PosedView) -> bool:
         turns = [np.array(view.rotation_cam_from_world) for view in (one, two)]
         shifts = [np.array(view.translation_cam_from_world) for view in (one, two)]
         first, second = (-turn.T @ shift for turn, shift in zip(turns, shifts, strict=True))

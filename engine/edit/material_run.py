@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.edit.edit_options import MaterialChange, Selection
+from octasplat.engine.edit.edit_options import MaterialChange
 from octasplat.engine.edit.material_change import refit_sh, with_materials
 from octasplat.engine.gaussians.materials import require_materials
 from octasplat.engine.gaussians.model import FlatGaussians
@@ -54,15 +54,3 @@ def has_known_light(source: Path) -> bool:
     if not is_run(source) or not run_environment(source).exists():
         return False
     return material_shading(read_config(source / CONFIG).train.materials.recipe).harmonics_are_shaded
-
-
-def describe_edit(
-    change: MaterialChange, selection: Selection, chosen: Bool[np.ndarray, " n"]
-) -> dict[str, object]:
-    """Return a short description of a change as JSON, for ``edits.json``."""
-    change_fields, where = set(MaterialChange.model_fields), set(Selection.model_fields)
-    return {
-        **change.model_dump(mode="json", exclude_defaults=True, include=change_fields),
-        **selection.model_dump(mode="json", exclude_defaults=True, include=where),
-        "gaussians": int(chosen.sum()),
-    }

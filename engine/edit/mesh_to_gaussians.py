@@ -7,8 +7,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
 
 from octasplat.engine.core.errors import SceneFileError
-from octasplat.engine.edit.axes import AXIS_ROTATIONS, default_axes, detect_axes, infer_q
+from octasplat.engine.edit.axes import AXIS_ROTATIONS, default_axes, detect_axes
 from octasplat.engine.edit.edit_options import MeshToGaussiansOptions
+from octasplat.engine.edit.exported_radii import exported_radii
 from octasplat.engine.edit.mesh_identity import check_mesh_of_scene
 from octasplat.engine.edit.neighbors import interpolate_motion, is_flipped, neighbour_rotations
 from octasplat.engine.edit.octagon_fit import MIN_CORNERS, fit_octagons
@@ -20,11 +21,9 @@ from octasplat.engine.gaussians.frames import rotation_matrices
 from octasplat.engine.gaussians.legs import has_area, legs_world, volume_derivatives
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 from octasplat.engine.gaussians.octagon import (
-    CHI2_2_99,
     coordinate_rounding_error,
     frames_from_octagons,
     octagon_corners_world,
-    octagon_radii,
 )
 
 STRAINED_RATIO = 0.3
@@ -62,13 +61,17 @@ def recover_gaussians(
         options: see there.
 
     Raises:
-        SceneFileError: the mesh does not belong to the scene, its vertices cannot be identified, or nothing
-            is left of the scene.
+        SceneFileError: the mesh does not belong to the scene, is only a part of it, its vertices cannot be
+            identified, or nothing is left of the scene.
     """
+    if mesh.part is not None:  # what lies in the others would count as deleted
+        raise SceneFileError(
+            f"{path}: is part {mesh.part[0]} of the {mesh.part[1]} files of its scene; export it as PLY to "
+            "edit it, or join all parts in the editor."
+        )
     options = options or MeshToGaussiansOptions()
     opacities = gaussians.opacities
-    q = options.q or infer_q(mesh, opacities, CHI2_2_99)
-    radii = octagon_radii(opacities, q)
+    q, radii = exported_radii(mesh, opacities, options.q)
     octagons = match_octagons(path, mesh, opacities, radii)
     geometry = gaussians.with_base_color_only()
     check_mesh_of_scene(path, mesh, octagons, geometry, radii)

@@ -8,14 +8,13 @@ from jaxtyping import Bool, Float
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.local_origin import NO_ORIGIN, Origin
 from octasplat.engine.dataset.region import Region
-from octasplat.engine.edit.axes import infer_q
 from octasplat.engine.edit.edit_options import Selection
+from octasplat.engine.edit.exported_radii import exported_radii
 from octasplat.engine.edit.filter_expression import filter_mask
 from octasplat.engine.edit.mesh_identity import check_mesh_of_scene
 from octasplat.engine.edit.octagon_matching import match_octagons
 from octasplat.engine.files import ImportedMesh
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.gaussians.octagon import CHI2_2_99, octagon_radii
 
 
 def selection_mask(
@@ -84,7 +83,7 @@ def in_mesh(gaussians: FlatGaussians, mesh: ImportedMesh, path: Path) -> Bool[np
         SceneFileError: the mesh does not belong to the scene, or its vertices cannot be identified.
     """
     opacities = gaussians.opacities
-    radii = octagon_radii(opacities, infer_q(mesh, opacities, CHI2_2_99))
+    _, radii = exported_radii(mesh, opacities)
     octagons = match_octagons(path, mesh, opacities, radii)
     check_mesh_of_scene(path, mesh, octagons, gaussians.with_base_color_only(), radii)
     chosen = np.zeros(len(gaussians), dtype=bool)

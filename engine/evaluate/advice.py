@@ -62,15 +62,19 @@ def advise(
     *,
     training_psnr: float | None,
     learns_exposure: bool,
+    are_held_out: bool = True,
 ) -> tuple[str, ...]:
     """Return what would help most, in sentences; none where nothing stands out.
 
     Args:
-        views: metrics of the held-out views.
+        views: metrics of the measured views.
         facts: of the same views by name.
         training_psnr: mean PSNR of the training views in dB, where it is known.
         learns_exposure: whether the exposures of the photographs were learnt.
+        are_held_out: whether the training has seen none of the views. Where it may have, they say nothing
+            of how well the scene generalizes.
     """
+    photographs = "held-out photographs" if are_held_out else "photographs"
     sentences = []
     coverage = _about_coverage(facts)
     if coverage is not None:
@@ -81,9 +85,7 @@ def advise(
         ways = "Lock exposure and white balance of the camera" + (
             "." if learns_exposure else ", or let the training learn them (--set exposure=true)."
         )
-        sentences.append(
-            f"{len(changed)} held-out photographs have other colors than the rest ({names}). {ways}"
-        )
+        sentences.append(f"{len(changed)} {photographs} have other colors than the rest ({names}). {ways}")
     usual = float(np.median([known.photograph_detail for known in facts.values()])) if facts else 0.0
     blurred = [
         name
@@ -92,11 +94,11 @@ def advise(
     ]
     if blurred:
         sentences.append(
-            f"{len(blurred)} held-out photographs are less sharp than their renders ({name_list(blurred)}). "
+            f"{len(blurred)} {photographs} are less sharp than their renders ({name_list(blurred)}). "
             "Leave blurred photographs out."
         )
     finite = [view.psnr for view in views if np.isfinite(view.psnr)]
-    if training_psnr is not None and finite:
+    if training_psnr is not None and finite and are_held_out:
         sentences += _about_fit(training_psnr, float(np.mean(finite)), is_covered=coverage is None)
     return tuple(sentences)
 

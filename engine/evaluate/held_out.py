@@ -64,6 +64,7 @@ def evaluate_held_out(
     environment: EnvironmentMap | None = None,
     relighter: Relighter | None = None,
     check: OtherWorldCheck | None = None,
+    are_held_out: bool = True,
 ) -> None:
     """Measure ``gaussians`` on the held-out views of ``dataset``.
 
@@ -83,6 +84,7 @@ def evaluate_held_out(
         environment: the map that the scene was learnt with.
         relighter: shows the scene in other light, for what the truth knows of that.
         check: warns if the photographs are of another world than the scene.
+        are_held_out: whether the training has seen none of these views; the report says so.
     """
     tracer = make_tracer(settings, threads=threads)
     tracer.build(gaussians, shading.features(gaussians))
@@ -128,10 +130,12 @@ def evaluate_held_out(
         facts,
         training_psnr=_training_psnr(run),
         learns_exposure=find_exposures(shading) is not None,
+        are_held_out=are_held_out,
     )
     stated = {"advice": list(advice)} if advice else {}
     covered = {"coverage": groups} if (groups := support_groups(facts)) else {}
-    metrics = summarize_views(rows).as_dict({**run, **covered, **stated})
+    seen = {} if are_held_out else {"held_out": False}
+    metrics = summarize_views(rows).as_dict({**run, **seen, **covered, **stated})
     write_json(output / METRICS, metrics)
     write_report(
         output / REPORT,

@@ -247,7 +247,8 @@ def _summary_tiles(
 
 def _run_facts(metrics: Mapping[str, object], views: int) -> list[str]:
     """Return short statements for the line under the title."""
-    facts = [f"{views} held-out view{'' if views == 1 else 's'}"]
+    noun = "held-out view" if metrics.get("held_out", True) else "view"
+    facts = [f"{views} {noun}{'' if views == 1 else 's'}"]
     resolution = metrics.get("resolution")
     if isinstance(resolution, Mapping):
         known = {key: value for key, value in resolution.items() if value is not None}

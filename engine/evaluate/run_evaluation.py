@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from octasplat.engine.core.errors import ConfigError, DatasetError, OutputError
+from octasplat.engine.core.errors import ConfigError, OutputError
 from octasplat.engine.core.events import EventListener, PhaseProgress, Warned
 from octasplat.engine.core.georeference import GEOREFERENCE_FILE, read_georeference
 from octasplat.engine.core.progress import counted_phase, phase
@@ -40,6 +40,7 @@ from octasplat.engine.runs.run_folder import (
     found_model_folder,
     has_photographs_of_run,
     open_run_dataset,
+    other_poses_error,
     photographs_folder,
     run_environment,
     run_extent,
@@ -185,10 +186,7 @@ def _check_coordinates(output: Path, dataset: Dataset, folder: Path) -> None:
         DatasetError: it does.
     """
     if (output / VIEWS).exists() and read_views(output / VIEWS).is_of_another_world(dataset.views_record):
-        raise DatasetError(
-            f"The photographs in {folder} have other poses than the scene of {output} was made or moved "
-            "with; name a folder whose model stands in the same world."
-        )
+        raise other_poses_error(output, folder)
 
 
 def measure_run(
@@ -250,6 +248,7 @@ def measure_run(
         environment=environment,
         relighter=relighter,
         check=check,
+        are_held_out=into is None,
     )
 
 

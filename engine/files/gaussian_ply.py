@@ -127,7 +127,9 @@ def read_ply_metadata(path: Path) -> SceneMetadata:
         try:
             known[name] = max(float(value), 0.0)
         except ValueError:
-            raise SceneFileError(f"{path}: its comment {name} is {value!r}, which is no number.") from None
+            known[name] = math.nan
+        if not math.isfinite(known[name]):  # max() passes on what is not a number
+            raise SceneFileError(f"{path}: its comment {name} is {value!r}, which is no number.")
     origin, georeference = parse_place(path, metadata)
     facts = SceneMetadata(**known, origin_world=origin, georeference=georeference)
     return replace(facts, turned_beyond=min(facts.turned_beyond, 1.0))  # it is a cosine

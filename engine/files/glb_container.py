@@ -35,7 +35,7 @@ MAX_BYTES = 2**32 - 1
 HEADER_BYTES, CHUNK_HEADER_BYTES = 12, 8
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
 UNSIGNED_BYTE, UNSIGNED_INT, FLOAT = 5121, 5125, 5126
-POINTS, TRIANGLES = 0, 4
+POINTS, TRIANGLES, TRIANGLE_STRIP, TRIANGLE_FAN = 0, 4, 5, 6
 LINEAR, LINEAR_MIPMAP_LINEAR, CLAMP_TO_EDGE = 9729, 9987, 33071
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
@@ -46,6 +46,9 @@ MAX_CHUNKS = 64
 MAX_PRIMITIVES = 100_000
 MAX_CHANNEL_COLUMNS = 10_000
 CHANNELS = "octasplat_channels"
+PART_KEY = "octasplat_part"
+"""In the extras of a file that is one of several of a scene: its place among them, from 1, and their number.
+"""
 ALL_ROWS = slice(None)
 GLB_READ_ERRORS = (KeyError, IndexError, TypeError, ValueError, AttributeError)
 """What reading a document that says nonsense may raise."""
@@ -350,7 +353,25 @@ def part_paths(path: Path, count: int) -> tuple[Path, ...]:
 
 def part_extras(part: int, count: int) -> dict[str, object]:
     """Return what the ``extras`` of a file say of its place among so many, from 1; nothing if it is alone."""
-    return {"octasplat_part": [part, count]} if count > 1 else {}
+    return {PART_KEY: [part, count]} if count > 1 else {}
+
+
+def stated_part(document: Mapping[str, Any]) -> tuple[int, int] | None:
+    """Return the place of a file among those of its scene, from 1, and their number; None if it is alone."""
+    match document.get("asset", {}).get("extras", {}).get(PART_KEY):
+        case [int(part), int(count)] if count > 1:
+            return part, count
+    return None
+
+
+def part_note(document: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return what to tell of a file that holds only a part of its scene."""
+    stated = stated_part(document)
+    if stated is None:
+        return ()
+    return (
+        f"It is part {stated[0]} of the {stated[1]} files of a scene; octasplat merge puts them together.",
+    )
 
 
 def glb_size(json_room: int, length: int) -> int:

@@ -6,7 +6,7 @@ glTF 2.0 (https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html) and its ext
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,9 @@ from octasplat.engine.geometry.mesh_material import FileImage, MeshMaterial
 SUPPORTED_EXTENSIONS = ("clearcoat", "emissive_strength", "ior", "transmission", "unlit", "volume")
 SUFFIXES = {"image/png": ".png", "image/jpeg": ".jpg", "image/webp": ".webp"}
 KINDS = {b"\x89PNG": ".png", b"\xff\xd8\xff": ".jpg", b"RIFF": ".webp"}
+REPEAT = 10497
+EDGE_TOLERANCE = 1e-3
+"""How far coordinates may lie beyond an image without being meant to."""
 PARTLY_SUPPORTED_EXTENSIONS = {
     "clearcoatNormalTexture", "thicknessTexture", "transmissionTexture"
 }  # fmt: skip
@@ -149,6 +152,26 @@ class _MaterialReader:
                         return True
         return False
 
+    def _leaves_its_images(self, number: int, infos: Sequence[Mapping[str, Any]]) -> bool:
+        """Return whether coordinates go beyond images that do not repeat there."""
+        document = self._file.document
+        samplers = [
+            document["samplers"][texture["sampler"]]
+            for texture in (document["textures"][info["index"]] for info in infos)
+            if "sampler" in texture
+        ]
+        if all(sampler.get(key, REPEAT) == REPEAT for sampler in samplers for key in ("wrapS", "wrapT")):
+            return False
+        place, matrix = texture_frame(self._material)
+        for mesh in document.get("meshes", []):
+            for primitive in mesh.get("primitives", []):
+                uv = primitive.get("attributes", {}).get(f"TEXCOORD_{place}")
+                if primitive.get("material") == number and uv is not None:
+                    found = self._file.array(uv, np.float64) @ matrix[:, :2].T + matrix[:, 2]
+                    if (np.abs(found - 0.5) > 0.5 + EDGE_TOLERANCE).any():
+                        return True
+        return False
+
     def _unsupported_features(self, number: int) -> tuple[str, ...]:
         """Return what is not understood, in words."""
         material = self._material
@@ -165,6 +188,8 @@ class _MaterialReader:
         for values in self._extensions.values():
             found += sorted(PARTLY_SUPPORTED_EXTENSIONS & set(values))
         infos = list(_texture_infos(material).values())
+        if self._leaves_its_images(number, infos):
+            found.append("images that are mirrored or end at their edges, as texture coordinates go beyond")
         if len({(i.get("texCoord", 0), str(i.get("extensions"))) for i in infos}) > 1:
             found.append("other texture coordinates than those of its first texture")
         return tuple(found)

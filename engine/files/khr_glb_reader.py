@@ -151,7 +151,10 @@ class _Splats:
             raise SceneFileError(f"{path}: its splats need {unknown}, which is not read.")
         self._packed: SpzSource | None = None
         self._is_linear = splats.get("colorSpace") == "lin_rec709_display"
-        self._notes = dropped_sh_message(_sh_degree_of(attributes))
+        self._notes = (
+            *glb_container.part_note(file.document),
+            *dropped_sh_message(_sh_degree_of(attributes)),
+        )
         if further:
             self._packed = parse_spz(path, file.view_bytes(further[COMPRESSION]["bufferView"]))
             self.count = self._packed.header.count

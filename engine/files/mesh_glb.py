@@ -22,7 +22,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Int, Int32
+from jaxtyping import Float32, Int, Int32, Int64
 
 from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.core.errors import ConfigError, SceneFileError
@@ -45,6 +45,7 @@ from octasplat.engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS, ha
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import SIDES, octagon_triangles
 from octasplat.engine.geometry.imported_mesh import (
+    ALPHA_CUTOFF_KEY,
     MIN_OPACITY_KEY,
     Q_KEY,
     SCENE_SIZE_KEY,
@@ -57,6 +58,9 @@ VIEWER_FORMAT = "viewer-glb"
 CORES_OF_CHUNKS, CORES_IN_ORDER = 0.3, 0.5
 """From which alpha on octagons are drawn solid for viewers, in chunks and in one order
 (docs/opening/threejs.md)."""
+TRIANGLE_MODES = (
+    glb_container.TRIANGLES, glb_container.TRIANGLE_STRIP, glb_container.TRIANGLE_FAN,
+)  # fmt: skip
 ATTRIBUTES = {"uv": "TEXCOORD_0", "gid": "_GID", "corner": "_CORNER", "radius": "_RADIUS"}
 MATERIAL_ATTRIBUTES = {"normal": "NORMAL", "color": "COLOR_0", "alpha": "COLOR_0"}
 ATTRIBUTE_WIDTHS = {"uv": 2, "normal": 3, "color": 3}
@@ -110,16 +114,18 @@ def _read_triangles(file: GlbFile, *, with_materials: bool) -> tuple[ImportedMes
     extras: dict[str, list[np.ndarray]] = {key: [] for key in names}
     count = 0
     for matrix, primitive in file.primitives():
-        if primitive.get("mode", glb_container.TRIANGLES) != glb_container.TRIANGLES:
+        mode = primitive.get("mode", glb_container.TRIANGLES)
+        if mode not in TRIANGLE_MODES:
             continue
         attributes = primitive["attributes"]
         positions = file.array(attributes["POSITION"], np.float64)
         size = len(positions)
         vertices.append(positions @ matrix[:3, :3].T + matrix[:3, 3])
         if "indices" in primitive:
-            indices = file.array(primitive["indices"], np.int64).reshape(-1, 3)
+            corners = file.array(primitive["indices"], np.int64).reshape(-1)
         else:
-            indices = np.arange(size - size % 3).reshape(-1, 3)
+            corners = np.arange(size - size % 3 if mode == glb_container.TRIANGLES else size)
+        indices = _triangles_of(corners, mode)
         # A node that mirrors turns the winding of its triangles over.
         mirrored = with_materials and np.linalg.det(matrix[:3, :3]) < 0
         triangles.append((indices[:, ::-1] if mirrored else indices) + count)
@@ -146,7 +152,7 @@ def _read_triangles(file: GlbFile, *, with_materials: bool) -> tuple[ImportedMes
     stated = file.document.get("asset", {}).get("extras", {})
     numbers_stated = {
         key: float(value)
-        for key in (Q_KEY, MIN_OPACITY_KEY)
+        for key in (Q_KEY, MIN_OPACITY_KEY, ALPHA_CUTOFF_KEY)
         if isinstance(value := stated.get(key), int | float)
     }
     mesh = ImportedMesh(
@@ -159,11 +165,24 @@ def _read_triangles(file: GlbFile, *, with_materials: bool) -> tuple[ImportedMes
         q=numbers_stated.get(Q_KEY),
         min_opacity=numbers_stated.get(MIN_OPACITY_KEY),
         scene_size=scene_size_of(stated.get(SCENE_SIZE_KEY)),
+        alpha_cutoff=numbers_stated.get(ALPHA_CUTOFF_KEY),
+        part=glb_container.stated_part(file.document),
         normals=joined.get("normal"),
         rgb_linear=joined.get("color"),
         alpha=_flatten_scalar(joined.get("alpha")),
     )
     return mesh, np.concatenate([*numbers, np.zeros(0, np.int32)])
+
+
+def _triangles_of(corners: Int64[np.ndarray, " c"], mode: int) -> Int64[np.ndarray, "t 3"]:
+    """Return the triangles of a list, a strip or a fan of vertices, all wound alike."""
+    if mode == glb_container.TRIANGLES:
+        return corners.reshape(-1, 3)
+    k = np.arange(max(len(corners) - 2, 0))
+    if mode == glb_container.TRIANGLE_FAN:
+        return corners[np.stack([k + 1, k + 2, np.zeros_like(k)], axis=1)]
+    odd = k % 2  # every other one is turned over
+    return corners[np.stack([k, k + 1 + odd, k + 2 - odd], axis=1)]
 
 
 def _concatenate_attribute(parts: list[np.ndarray]) -> np.ndarray | None:
@@ -244,7 +263,7 @@ def _file_extras(soup: OctagonSoup, options: ExportOptions, parts: int) -> list[
         SCENE_SIZE_KEY: soup.scene_size,
     }
     if options.opaque:
-        extras["octasplat_opaque_cutoff"] = OPAQUE_CUTOFF
+        extras[ALPHA_CUTOFF_KEY] = OPAQUE_CUTOFF
     extras |= glb_container.channel_extras(soup.channel_widths)
     return [extras | glb_container.part_extras(part, parts) for part in range(1, parts + 1)]
 

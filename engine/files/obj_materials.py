@@ -20,6 +20,13 @@ IMAGES = {
 }  # fmt: skip
 IGNORED_KEYS = {"Ka", "Ks", "Tf", "Ns", "newmtl", "map_Ka", "map_Ks"}
 """What older programs write into every file, and what has no counterpart."""
+IMAGE_OPTIONS = {
+    "-s": ("1", "1"), "-o": ("0", "0"), "-t": ("0", "0"), "-mm": ("0", "1"), "-bm": ("1",),
+    "-clamp": ("off",), "-cc": ("off",),
+}  # fmt: skip
+"""Options of images, with the values that ask for nothing; a third number of a place is its depth."""
+IGNORED_OPTIONS = {"-blendu", "-blendv", "-boost", "-texres"}
+"""Options of how an image is made smaller, which is not done here."""
 GLASS_ILLUM_MODELS = (4, 6, 7, 9)
 """Illumination models with refraction or with transparency by ray tracing."""
 
@@ -66,9 +73,15 @@ def _parse_material(path: Path, entry: dict[str, str]) -> MeshMaterial:
         red, green, blue = _parse_numbers(path, key, entry[key], 3)
         colors[key] = (red, green, blue)
     found: dict[str, Any] = {}
+    passed_over: list[str] = []
     for key, field in IMAGES.items():
         if key in entry:
-            found[field] = resolve_image(path, _file_name(entry[key]))
+            options, name = _image_options(entry[key])
+            found[field] = resolve_image(path, name)
+            if key == "norm" and "-bm" in options:
+                words = " ".join(options.pop("-bm"))
+                found["normal_scale"] = _parse_numbers(path, "-bm of norm", words, 1)[0]
+            passed_over += [f"{option} of {key}" for option, words in options.items() if _says(option, words)]
     if "texture" in found:
         colors["Kd"] = (1.0, 1.0, 1.0)  # programs leave a grey here that the image is not meant to have
     # Images are multiplied by the color, which may be missing or black beside them.
@@ -77,7 +90,7 @@ def _parse_material(path: Path, entry: dict[str, str]) -> MeshMaterial:
     opacity = numbers.get("d", 1.0 - numbers.get("Tr", 0.0))  # Tr is transparency
     clear = int(numbers.get("illum", 0)) in GLASS_ILLUM_MODELS and ("Ni" in numbers or opacity < 1.0)
     known = NUMBERS | COLORS | set(IMAGES) | IGNORED_KEYS
-    passed_over = [key for key in entry if key not in known]
+    passed_over += [key for key in entry if key not in known]
     return MeshMaterial(
         entry["newmtl"],
         colors.get("Kd", (0.6, 0.6, 0.6)),
@@ -107,15 +120,28 @@ def _parse_numbers(path: Path, key: str, text: str, count: int) -> tuple[float, 
     return values
 
 
-def _file_name(text: str) -> str:
-    """Return the name of an image behind its options, such as ``-bm 0.3 wood bark.png``."""
+def _image_options(text: str) -> tuple[dict[str, list[str]], str]:
+    """Return the options of an image and its name, of a text such as ``-bm 0.3 wood bark.png``."""
     words = text.split()
+    options: dict[str, list[str]] = {}
     k = 0
     while k < len(words) and words[k].startswith("-") and len(words[k]) > 1:
-        k += 1
+        first = k = k + 1
         while k < len(words) - 1 and (_is_number(words[k]) or words[k] in ("on", "off")):
             k += 1
-    return " ".join(words[k:])
+        options[words[first - 1]] = words[first:k]
+    return options, " ".join(words[k:])
+
+
+def _says(option: str, words: Sequence[str]) -> bool:
+    """Return whether an option of an image asks for anything else than is done without it."""
+    if option not in IMAGE_OPTIONS:
+        return option not in IGNORED_OPTIONS
+    usual = IMAGE_OPTIONS[option]
+    return any(
+        (float(word) != float(default)) if _is_number(word) and _is_number(default) else word != default
+        for word, default in zip(words, usual, strict=False)
+    )
 
 
 def _is_number(word: str) -> bool:

@@ -1,6 +1,5 @@
 """Octagons of a scene in batches, with texture coordinates and colors, for all mesh formats."""
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,10 +14,9 @@ from octasplat.engine.gaussians.channels import Channels
 from octasplat.engine.gaussians.flattening import row_slices
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import (
-    APOTHEM,
     corner_directions,
+    cut_octagon_radii,
     octagon_corners_world,
-    octagon_radii,
 )
 from octasplat.engine.gaussians.rows import allocate_rows, overwrite_rows
 
@@ -105,12 +103,7 @@ class OctagonSoup:
         return len(self.ids)
 
     def _radii(self, opacities: Float32[np.ndarray, " n"]) -> Float32[np.ndarray, " n"]:
-        radii = octagon_radii(opacities, self.q)
-        if self._alpha_cutoff is None:
-            return radii
-        # The octagon surrounds the ellipse: its sides touch it, not its corners.
-        around = octagon_radii(opacities, -2.0 * math.log(self._alpha_cutoff)) / np.float32(APOTHEM)
-        return np.minimum(radii, around)
+        return cut_octagon_radii(opacities, self.q, self._alpha_cutoff)
 
     @property
     def channel_widths(self) -> dict[str, int]:

@@ -52,7 +52,9 @@ def read_octagons(file: GlbFile, path: Path, q: float, channels: ChannelChoice) 
         raise ValueError("its primitives differ in channels")
     count = sum(part.count for part in parts)
     stated = int(file.document["asset"]["extras"].get(SCENE_SIZE_KEY, 0))
-    notes = missing_gaussians_notes(stated, count)
+    part = glb_container.part_note(file.document)
+    # of a part of a scene, others have the rest
+    notes = (*missing_gaussians_notes(0 if part else stated, count), *part)
     order = OctagonOrder(np.concatenate([part.ids() for part in parts]))
 
     def blocks() -> Iterator[tuple[Int[np.ndarray, " n"], GaussianCloud]]:

@@ -12,7 +12,7 @@ from octasplat.engine.core.progress import phase
 from octasplat.engine.files.channel_columns import ChannelChoice
 from octasplat.engine.files.gaussian_ply import read_ply_metadata
 from octasplat.engine.files.glb_container import read_glb_metadata
-from octasplat.engine.files.registry import importer_for, mesh_reader_for
+from octasplat.engine.files.registry import importer_for, mesh_reader_for, read_head
 from octasplat.engine.gaussians.flattening import ImportReport, flatten
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.scene_metadata import UNKNOWN_METADATA, SceneMetadata
@@ -61,16 +61,18 @@ def read_scene(
 def read_metadata(path: Path) -> SceneMetadata:
     """Return the metadata that a file or a run's scene states: our PLY all, a GLB its place, others none.
 
-    The georeference of a run's scene is in a file beside it, see :mod:`octasplat.engine.core.georeference`.
+    What the file begins with decides, as it does where the scene is read, whatever the file is called. The
+    georeference of a run's scene is in a file beside it, see :mod:`octasplat.engine.core.georeference`.
 
     Raises:
         SceneFileError: the file cannot be read or is damaged.
         ConfigError: the georeference beside it cannot be read.
     """
     source = _scene_file(path)
-    if source.suffix.lower() == ".glb":
+    start = read_head(source)
+    if start.startswith(b"glTF"):
         return read_glb_metadata(source)
-    facts = read_ply_metadata(source) if source.suffix.lower() == ".ply" else UNKNOWN_METADATA
+    facts = read_ply_metadata(source) if start.startswith(b"ply") else UNKNOWN_METADATA
     if source.name == FOLDER_FILES[0]:
         beside = read_georeference(source.with_name(GEOREFERENCE_FILE))
         return facts if beside is None else replace(facts, georeference=beside)

@@ -156,7 +156,7 @@ def importer_for(path: Path, format: str | None = None) -> Importer:
     """
     if format is not None:
         return _TABLE.get(Importer, format, path)
-    head = _head(path)
+    head = read_head(path)
     for importer in importers():
         if importer.matches_head(head):
             return importer
@@ -225,7 +225,12 @@ def surface_suffixes() -> str:
     return _TABLE.suffixes(SurfaceWriter)
 
 
-def _head(path: Path) -> bytes:
+def read_head(path: Path) -> bytes:
+    """Return the first bytes of a file, up to :data:`HEAD_BYTES`.
+
+    Raises:
+        SceneFileError: it cannot be read.
+    """
     try:
         with path.open("rb") as handle:
             return handle.read(HEAD_BYTES)

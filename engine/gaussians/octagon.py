@@ -3,6 +3,8 @@
 "The paper" is "REdiSplats: Ray Tracing for Editable Gaussian Splatting" (https://arxiv.org/abs/2503.12284).
 """
 
+import math
+
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
@@ -33,6 +35,27 @@ def octagon_radii(opacities: Float[np.ndarray, " n"], q: float = CHI2_2_99) -> F
         return np.sqrt(np.maximum(0.0, q + 2.0 * np.log(opacities.astype(np.float64)))).astype(
             opacities.dtype
         )
+
+
+def cut_octagon_radii(
+    opacities: Float[np.ndarray, " n"], q: float, alpha_cutoff: float | None
+) -> Float[np.ndarray, " n"]:
+    """Return :func:`octagon_radii`, no larger than it takes to show all that reaches an alpha.
+
+    Args:
+        opacities: of the Gaussians.
+        q: chi-square quantile.
+        alpha_cutoff: the octagon surrounds the ellipse in which alpha reaches that: its sides touch it, not
+            its corners. None cuts nothing.
+
+    >>> cut_octagon_radii(np.array([1.0, 0.5, 0.1]), CHI2_2_99, 0.2).round(3).tolist()
+    [1.942, 1.465, 0.0]
+    """
+    radii = octagon_radii(opacities, q)
+    if alpha_cutoff is None:
+        return radii
+    around = octagon_radii(opacities, -2.0 * math.log(alpha_cutoff)) / np.float32(APOTHEM)
+    return np.minimum(radii, around)
 
 
 def corner_directions() -> Float[np.ndarray, "8 2"]:

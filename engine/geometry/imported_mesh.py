@@ -25,6 +25,8 @@ class ImportedMesh:
         q: chi-square quantile of the octagons, where the file still names it.
         min_opacity: octagons were made of Gaussians at least this opaque, where the file still says so.
         scene_size: number of Gaussians of the exported scene, where the file still says so.
+        alpha_cutoff: octagons were made no larger than what reaches this alpha, where the file still says it.
+        part: place of the file among those of its scene, from 1, and their number; None if it is alone.
         rounding: how far a coordinate may be off because of the digits that the file keeps, beyond float32.
         corner_uv: of a mesh read with its looks: texture coordinates of the triangles' corners, (0, 0) at the
             upper left, NaN where there are none; None without any.
@@ -44,6 +46,8 @@ class ImportedMesh:
     q: float | None = None
     min_opacity: float | None = None
     scene_size: int | None = None
+    alpha_cutoff: float | None = None
+    part: tuple[int, int] | None = None
     rounding: float = 0.0
     corner_uv: Float32[np.ndarray, "t 3 2"] | None = None
     normals: Float32[np.ndarray, "v 3"] | None = None
@@ -73,6 +77,7 @@ def flip_v(uv: Float32[np.ndarray, "v 2"]) -> Float32[np.ndarray, "v 2"]:
 Q_KEY = "octasplat_q"
 SCENE_SIZE_KEY = "octasplat_gaussians"
 MIN_OPACITY_KEY = "octasplat_min_opacity"
+ALPHA_CUTOFF_KEY = "octasplat_opaque_cutoff"
 
 
 def scene_size_of(stated: object) -> int | None:

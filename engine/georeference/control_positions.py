@@ -27,7 +27,8 @@ class ScenePoints:
         self._index = {view.name: index for index, view in enumerate(dataset.views)}
         self._points = {} if control is None else {point.name: point for point in control.points}
         marked = {mark.photograph for point in self._points.values() for mark in point.marks}
-        self._views = match_image_names([*marked, *self._points], self._index.keys())
+        # without names of points: one that is like a photograph's would leave it open whose it is
+        self._views = match_image_names(marked, self._index.keys())
 
     def camera_centres(self) -> Float64[np.ndarray, "n 3"]:
         """Return the positions of all cameras."""

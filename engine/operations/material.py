@@ -13,6 +13,7 @@ from octasplat.engine.operations.base import (
     SceneRequest,
     ScenesWritten,
     never_stop,
+    options_of,
     stop_if,
 )
 from octasplat.engine.settings.fields import InputFile, Output, Spelling
@@ -75,11 +76,16 @@ def run(
         SceneFileError: the scene or the mesh cannot be read, or the scene not be written.
     """
     from octasplat.engine.edit.mask_selection import select_by_masks
-    from octasplat.engine.edit.material_run import change_materials, describe_edit, has_known_light
+    from octasplat.engine.edit.material_run import change_materials, has_known_light
     from octasplat.engine.edit.selection import in_mesh, selection_mask
     from octasplat.engine.files import read_mesh, read_metadata
     from octasplat.engine.gaussians.materials import require_materials
-    from octasplat.engine.operations.scene_io import check_edited_output, open_scene, write_edited_scene
+    from octasplat.engine.operations.scene_io import (
+        check_edited_output,
+        describe_edit,
+        open_scene,
+        write_edited_scene,
+    )
     from octasplat.engine.runs.run_folder import SCENE, is_run
 
     source, output = request.source, request.output
@@ -101,9 +107,7 @@ def run(
         notes.append(
             "Viewers show their harmonics, which are as before; octasplat relight shows the materials."
         )
-    mesh = {"mesh": request.mesh.name} if request.mesh is not None else {}
-    masks = {"masks": [path.name for path in request.masks]} if request.masks else {}
-    record = describe_edit(request, request, chosen) | mesh | masks
+    record = describe_edit("material", options_of(MaterialOptions, request), gaussians=count)
     stop_if(should_stop)
     written = write_edited_scene(source, changed, output, progress, edit_record=record)
     return MaterialResult(

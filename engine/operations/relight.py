@@ -218,7 +218,7 @@ def run(
             request.spin,
             background,
             request.format,
-            *output.numbered(shots),
+            *output.numbered(shots, counts=request.spin and cameras is None),
         )
     )
     relighter = _make_relighter(request, source, learnt, threads)

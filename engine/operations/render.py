@@ -9,7 +9,12 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from octasplat.engine.core.events import EventListener, Warned, ignore_events
 from octasplat.engine.operations.base import Operation, Result, never_stop
-from octasplat.engine.operations.render_options import PictureOptions, PictureRequest, check_layers
+from octasplat.engine.operations.render_options import (
+    UP_OF_RUN_UNUSED,
+    PictureOptions,
+    PictureRequest,
+    check_layers,
+)
 from octasplat.engine.pathtracing.stage.model import Stage
 from octasplat.engine.pathtracing.stage.stage_file import read_stage, referenced_files, toml_complaint
 from octasplat.engine.pathtracing.stage.text_bounds import check_stage_text
@@ -214,6 +219,8 @@ def run(
         # a stage says itself how Gaussians are lit
         shading=request.shading if request.stage is None else "harmonics",
     )
+    if request.up is not None and source.viewpoints is not None:
+        report(Warned(UP_OF_RUN_UNUSED))
     cameras = requested_cameras(request, source)
     shots = requested_views(request, source) if cameras is None else camera_shots(cameras)
     written = shots[:1] if request.preview else shots
@@ -269,6 +276,7 @@ def _render_on_stage(plan: _RenderPlan, progress: EventListener, threads: int) -
     request, source, cameras, shots, output = plan
     from octasplat.engine.operations.render_source import stage_scene
     from octasplat.engine.pathtracing.stage.stage_file import stage_identity
+    from octasplat.engine.pathtracing.stage_motion import is_moving
     from octasplat.engine.pathtracing.stage_rendering import compile_stage
     from octasplat.engine.render.render_digest import render_digest
     from octasplat.engine.render.renderer import background_color
@@ -287,7 +295,8 @@ def _render_on_stage(plan: _RenderPlan, progress: EventListener, threads: int) -
     finished = output.finished_images(
         render_digest(
             source.gaussians, source.settings, background, False, cameras,
-            stage_identity(stage, request.stage_folder), views, scene.photographs, *output.numbered(shots),
+            stage_identity(stage, request.stage_folder), views, scene.photographs,
+            *output.numbered(shots, counts=is_moving(stage) and cameras is None),
         )
     )  # fmt: skip
     return output.write(shots, compile_stage(stage, scene, shots).render_fn, finished, progress)

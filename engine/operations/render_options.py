@@ -26,6 +26,10 @@ PhotographName = Annotated[str, Field(min_length=1, max_length=1000)]
 
 DEFAULT_FPS = 30.0
 MAX_SIDE_PX = 16384
+UP_OF_RUN_UNUSED = (
+    "The axis that points up (up) goes with a file; the photographs of a run say so themselves, and it is "
+    "passed over."
+)
 
 
 class PictureOptions(Options):

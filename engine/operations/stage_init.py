@@ -7,10 +7,10 @@ from typing import ClassVar
 from pydantic import Field
 
 from octasplat.engine.core.errors import OutputError
-from octasplat.engine.core.events import EventListener, ignore_events
+from octasplat.engine.core.events import EventListener, Warned, ignore_events
 from octasplat.engine.operations.axes import Axis, axis_named
 from octasplat.engine.operations.base import Operation, Options, Result, WritingRequest, never_stop, stop_if
-from octasplat.engine.operations.render_options import Point
+from octasplat.engine.operations.render_options import UP_OF_RUN_UNUSED, Point
 from octasplat.engine.settings import renamed_settings
 from octasplat.engine.settings.fields import DatasetFolder, Output, Source
 
@@ -78,6 +78,8 @@ def run(
     output: Path = request.output
     check_targets("stage-init", [output], [request.source, request.dataset], overwrite=request.overwrite)
     scene = open_stage_scene(request.source, progress, dataset=request.dataset, threads=threads)
+    if request.up is not None and scene.photographs is not None:
+        progress(Warned(UP_OF_RUN_UNUSED))
     facts = first_stage_layout(scene, None if request.up is None else axis_named(request.up))
     stop_if(should_stop)
     try:

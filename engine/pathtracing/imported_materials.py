@@ -53,14 +53,25 @@ def import_material(
         raise ConfigError(f"the material {source.name} holds a number that is negative or not finite.")
     left_out = list(source.unsupported)
     ior = min(source.ior, MAX_IOR) if source.ior >= 1.0 else 1.5
+    if ior != source.ior:
+        left_out.append(f"an index of refraction of {source.ior:g} ({ior:g} is taken)")
     material: Material
     if source.transmission >= 0.5:
-        named = {"texture": source.texture, "normal texture": source.normal_texture}
+        named = {
+            "texture": source.texture,
+            "texture of metallic and roughness": source.metallic_roughness_texture,
+            "normal texture": source.normal_texture,
+        }
         left_out += [f"{key} on glass" for key, image in named.items() if image is not None]
         if source.opacity < 1.0 or source.opacity_texture is not None or source.uses_vertex_alpha:
             left_out.append("opacity of glass")
         if source.clear_coat > 0.0:
             left_out.append("a clear coat on glass")
+        if max(source.emission_linear) > 0.0:
+            left_out.append("light of its own of glass")
+        # its texture, which is told above, may say that there is no metal
+        if source.metallic > 0.0 and source.metallic_roughness_texture is None:
+            left_out.append(f"metallic {source.metallic:g} of glass")
         if not is_closed():
             left_out.append("the refraction of glass that is not closed")
             ior = THIN_IOR
@@ -76,6 +87,8 @@ def import_material(
     else:
         if source.transmission > 0.0:
             left_out.append(f"transmission {source.transmission:g}, which is less than half")
+        if source.normal_texture is not None and source.normal_scale < 0.0:
+            left_out.append("the sign of the scale of its normal texture")
         if source.clear_coat > 0.0 and source.normal_texture is not None:
             left_out.append("a clear coat that is smoother than the normal texture")
         fields = {

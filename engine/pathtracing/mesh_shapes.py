@@ -233,7 +233,10 @@ def _sphere_shape() -> MeshShape:
     vertices = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
     corners = vertices[faces]
     u = 0.5 + np.arctan2(corners[..., 0], corners[..., 2]) / (2 * np.pi)
-    u = np.where(u.max(axis=1, keepdims=True) - u > 0.5, u + 1, u)  # faces across the seam
+    # a pole has no longitude: the middle of the face's other two
+    u = np.where(np.hypot(corners[..., 0], corners[..., 2]) < 1e-9, np.nan, u)
+    u = np.where(np.nanmax(u, axis=1, keepdims=True) - u > 0.5, u + 1, u)  # faces across the seam
+    u = np.where(np.isnan(u), np.nanmean(u, axis=1, keepdims=True), u)
     uv = np.stack([u, np.arccos(np.clip(corners[..., 1], -1, 1)) / np.pi], axis=-1)
     return MeshShape(vertices, faces.astype(np.int64), uv.astype(np.float32), vertices)
 

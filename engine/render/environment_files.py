@@ -11,7 +11,7 @@ from jaxtyping import Float32
 
 from octasplat.engine.core.color import linear_to_srgb, srgb_to_linear
 from octasplat.engine.core.errors import ConfigError, DatasetError
-from octasplat.engine.render.image_files import read_image, write_exr, write_rgbe
+from octasplat.engine.render.image_files import read_image, stated_exposure, write_exr, write_rgbe
 
 MAX_PIXELS = 1 << 27
 
@@ -22,7 +22,8 @@ def read_environment(path: Path, warn: Callable[[str], None] | None = None) -> F
     Args:
         path: the image.
         warn: called with a sentence where values that no light has are replaced, and where the image is
-            black or has not the shape of such a map. None refuses such values and says nothing of the rest.
+            black, has not the shape of such a map, or states an exposure. None refuses such values and says
+            nothing of the rest.
 
     Raises:
         ConfigError: the file is no such image, or holds values that are negative or not finite and nobody
@@ -31,7 +32,7 @@ def read_environment(path: Path, warn: Callable[[str], None] | None = None) -> F
     if path.suffix.lower() not in (".hdr", ".exr", ".pic"):
         raise ConfigError(f"{path}: an environment is an HDR or EXR image; an 8-bit one holds no light.")
     try:
-        image = read_image(path)
+        image, exposure = read_image(path, as_shown=True), stated_exposure(path)
     except DatasetError as error:
         raise ConfigError(f"{path}: the environment cannot be read: {error}") from None
     if image.shape[0] * image.shape[1] > MAX_PIXELS:
@@ -55,6 +56,11 @@ def read_environment(path: Path, warn: Callable[[str], None] | None = None) -> F
             warn(
                 f"{path}: is {width} x {height} pixels; an equirectangular map is twice as wide as high, so "
                 "this one is stretched around."
+            )
+        if exposure != 1.0:
+            warn(
+                f"{path}: says that its values were multiplied by {exposure:g} (EXPOSURE); they are taken as "
+                "they are."
             )
         if not rgb.any():
             warn(f"{path}: is black, so that it lights nothing.")

@@ -6,7 +6,7 @@ its readers expect, linear light: ``exr_layers`` converts.
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import OpenImageIO as oiio
@@ -20,8 +20,25 @@ from octasplat.engine.core.writing import atomic_replace
 
 _RAW_CONFIG = "oiio:UnassociatedAlpha"
 """Keeps OpenImageIO from multiplying or dividing colors by alpha on its own."""
+MAX_WINDOW_PIXELS = 1 << 27
 _FIXED_TIMESTAMP = "1970:01:01 00:00:00"
 """Else OpenImageIO notes the time in an EXR, and the same picture would have other bytes each time."""
+
+
+class _Axes(NamedTuple):
+    """How rows and columns of stored pixels become those of an image: swapped first, then maybe reversed."""
+
+    transposed: bool
+    down: int
+    right: int
+
+
+_RADIANCE_AXES = {
+    1: _Axes(False, 1, 1), 2: _Axes(False, 1, -1), 3: _Axes(False, -1, -1), 4: _Axes(False, -1, 1),
+    5: _Axes(True, 1, 1), 6: _Axes(True, -1, 1), 7: _Axes(True, -1, -1), 8: _Axes(True, 1, -1),
+}  # fmt: skip
+"""By OpenImageIO's number for the line of a Radiance picture that names its axes: -Y +X, -Y -X, +Y -X, +Y +X,
++X -Y, +X +Y, -X +Y, -X -Y. Exif means other turns by 6 and 8."""
 
 
 def exr_layers(
@@ -136,10 +153,15 @@ def write_rgbe(path: Path, rgb_linear: Float32[np.ndarray, "h w 3"]) -> None:
     _write(path, oiio.ImageSpec(width, height, channels, oiio.FLOAT), rounded)
 
 
-def read_image(path: Path) -> Float32[np.ndarray, "h w c"]:
+def read_image(path: Path, *, as_shown: bool = False) -> Float32[np.ndarray, "h w c"]:
     """Return an image with all its channels, as stored: 8- and 16-bit values scaled to [0, 1], floats as is.
 
     Alpha is neither multiplied in nor divided out.
+
+    Args:
+        path: The file.
+        as_shown: Turn a Radiance picture as its head says, and return the display window of an EXR, black
+            where that has no pixels.
 
     Raises:
         DatasetError: The file is missing, damaged or of no known format.
@@ -157,9 +179,47 @@ def read_image(path: Path) -> Float32[np.ndarray, "h w c"]:
         if pixels is None:
             raise DatasetError(f"The image {path} is damaged: {image_message(source)}.")
         shape = (spec.height, spec.width, spec.nchannels)
-        return np.asarray(pixels, dtype=np.float32).reshape(shape)
+        stored = np.asarray(pixels, dtype=np.float32).reshape(shape)
+        return _as_shown(stored, spec, source.format_name()) if as_shown else stored
     finally:
         source.close()
+
+
+def stated_exposure(path: Path) -> float:
+    """Return the factor by which the values of a Radiance picture were multiplied, as its head says, else 1.
+
+    Raises:
+        DatasetError: The file is missing, damaged or of no known format.
+    """
+    source = oiio.ImageInput.open(str(path))
+    if source is None:
+        raise DatasetError(f"Cannot read {path} as an image: {image_message(oiio)}.")
+    try:
+        return float(source.spec().get_float_attribute("hdr:exposure", 1.0))
+    finally:
+        source.close()
+
+
+def _as_shown(pixels: Float32[np.ndarray, "h w c"], spec: Any, kind: str) -> Float32[np.ndarray, "a b c"]:
+    """Return the pixels of a Radiance picture turned upright, or those in the display window of an EXR."""
+    if kind == "hdr":
+        axes = _RADIANCE_AXES[spec.get_int_attribute("Orientation", 1)]
+        turned = pixels.swapaxes(0, 1) if axes.transposed else pixels
+        return np.ascontiguousarray(turned[:: axes.down, :: axes.right])
+    window = (spec.full_height, spec.full_width)
+    top, left = spec.y - spec.full_y, spec.x - spec.full_x
+    if (top, left) == (0, 0) and pixels.shape[:2] == window:
+        return pixels
+    if window[0] * window[1] > MAX_WINDOW_PIXELS:
+        raise DatasetError(f"its display window has more than {MAX_WINDOW_PIXELS >> 20} million pixels.")
+    shown = np.zeros((*window, pixels.shape[2]), np.float32)
+    rows = slice(max(top, 0), min(top + spec.height, window[0]))
+    columns = slice(max(left, 0), min(left + spec.width, window[1]))
+    if rows.start < rows.stop and columns.start < columns.stop:
+        shown[rows, columns] = pixels[
+            rows.start - top : rows.stop - top, columns.start - left : columns.stop - left
+        ]
+    return shown
 
 
 def shrink_to(image: Float32[np.ndarray, "h w c"], max_side_px: int) -> Float32[np.ndarray, "a b c"]:

@@ -75,9 +75,15 @@ class RenderOutput:
             return self.path / f"{shot.name}{'.exr' if self.exr else '.png'}"
         return self.path.with_name(self.path.name % number) if has_number_pattern(self.path) else self.path
 
-    def numbered(self, shots: Sequence[Shot]) -> tuple[list[str], ...]:
-        """Return the names of the shots where files have numbers only: what those stand for; else nothing."""
-        return ([shot.name for shot in shots],) if self.is_image_name else ()
+    def numbered(self, shots: Sequence[Shot], *, counts: bool = False) -> tuple[list[str], ...]:
+        """Return the names of the shots where their order matters, as digests take them; else nothing.
+
+        Args:
+            shots: the views of photographs, or cameras.
+            counts: whether what a shot shows depends on its number; else its order matters where files have
+                numbers only.
+        """
+        return ([shot.name for shot in shots],) if counts or self.is_image_name else ()
 
     def files_of(self, shots: Sequence[Shot]) -> tuple[Path, ...]:
         """Return all files that are written for shots: images, or a video and its frames."""

@@ -99,7 +99,8 @@ def run_viewpoints(
 
     Raises:
         ConfigError: ``output`` is no run.
-        DatasetError: the run keeps no cameras, as runs of old, and the photographs cannot be used.
+        DatasetError: the run keeps no cameras, as runs of old, and the photographs cannot be used; or they
+            are the run's and stand in another world than its scene, as after a transform.
     """
     config = read_config(output / CONFIG)
     max_side = max_side or config.max_side
@@ -114,10 +115,24 @@ def run_viewpoints(
         model=model,
         origin_world=run_origin(output),
     )
+    if (
+        (output / VIEWS).exists()
+        and read_views(output / VIEWS).has_other_poses(photographs.views)
+        and has_photographs_of_run(output, folder)  # others of the same names may stand anywhere
+    ):
+        raise other_poses_error(output, folder)
     rule = SplitRule(
         config.test_every, config.held_out, config.burst_length, config.split, stored_split(output)
     )
     return scene_viewpoints(photographs, rule)
+
+
+def other_poses_error(output: Path, folder: Path) -> DatasetError:
+    """Return what to say of photographs of a run whose model stands in another world than its scene."""
+    return DatasetError(
+        f"The photographs in {folder} have other poses than the scene of {output} was made or moved with; "
+        "name a folder whose model stands in the same world."
+    )
 
 
 def stored_split(output: Path) -> dict[str, bool] | None:

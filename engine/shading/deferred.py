@@ -300,6 +300,10 @@ class DeferredShading:
 
     # --- the steps in which recipes differ ---
 
+    def relight_with(self, radiance_linear: Float32[np.ndarray, "h w 3"]) -> None:
+        """Take an environment of linear radiance instead of the learnt one."""
+        self.light.set_radiance(radiance_linear)
+
     def _shaded_share(self, traced: TracedRays, gbuffer: GBuffer, ramp: float) -> Float64[np.ndarray, " p"]:
         """Return the share of each point that is shaded, not taken from the harmonics."""
         return np.full(len(gbuffer.ray_ids), ramp)

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from octasplat.engine.core.color import srgb_to_linear
+from octasplat.engine.core.color import linear_to_srgb, srgb_to_linear
 from octasplat.engine.gaussians.materials import (
     DIFFUSE_INTERREFLECTION,
     MATERIAL_WIDTHS,
@@ -114,6 +114,10 @@ class RefGaussianShading(DeferredShading):
         """Take the state that :meth:`state` returned."""
         super().restore(state)
         self._has_restarted = state["materials.started_over"].copy()
+
+    def relight_with(self, radiance_linear: Float32[np.ndarray, "h w 3"]) -> None:
+        """Take an environment of linear radiance in display values, in which all is computed here."""
+        super().relight_with(linear_to_srgb(radiance_linear))
 
     def _split_into_layers(self, traced: TracedRays) -> DepthLayers:
         return single_layer(traced.rays, traced.result)

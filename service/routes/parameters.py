@@ -18,15 +18,13 @@ IdempotencyKey = Annotated[
 ]
 IfMatch = Annotated[
     str | None,
-    Header(
-        alias="If-Match", max_length=1000, description="ETag that it must still have, else the answer is 412."
-    ),
+    # However long conditions are: one that names no current ETag does not hold, as RFC 9110 says.
+    Header(alias="If-Match", description="ETag that it must still have, else the answer is 412."),
 ]
 IfNoneMatch = Annotated[
     str | None,
     Header(
         alias="If-None-Match",
-        max_length=1000,
         description="ETag that you have seen; as long as it is that, the answer is 304.",
     ),
 ]
@@ -37,7 +35,7 @@ Range = Annotated[
 ]
 IfRange = Annotated[
     str | None,
-    Header(alias="If-Range", max_length=1000, description="ETag that must hold, else `Range` is ignored."),
+    Header(alias="If-Range", description="ETag that must hold, else `Range` is ignored."),
 ]
 DatasetId = Annotated[uuid.UUID, Path(description="Id of the dataset.")]
 JobId = Annotated[uuid.UUID, Path(description="Id of the job.")]

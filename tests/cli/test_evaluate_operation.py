@@ -55,6 +55,8 @@ def test_evaluate_all_views_with_other_background(copy, run, octasplat):
     assert done.exit_code == 0, done.output
     metrics = json.loads((copy / "on" / run.scene.name / "metrics.json").read_text())
     assert len(metrics["views"]) == 8 and metrics["background"] == "white"
+    page = (copy / "on" / run.scene.name / "report.html").read_text()
+    assert "8 views" in page and "8 held-out" not in page
     assert "Mean over 8" in done.output and (copy / "metrics.json").read_bytes() == before
 
 

@@ -59,6 +59,7 @@ def test_material_output_folder_is_a_run(shiny_run, changed, octasplat, tmp_path
     assert not (changed / "metrics.json").exists()
     assert (changed / "environment.hdr").read_bytes() == (shiny_run / "environment.hdr").read_bytes()
     [note] = json.loads((changed / "edits.json").read_text())
+    assert note["operation"] == "material" and note["gaussians"] > 0
     assert note["where"] == "x > 0 and roughness < 0.6" and note["set"]["metallic"] == 0
     light = ("--environment", changed / "environment.hdr", "--integrator", "path", "--samples", 4)
     for run, name in ((shiny_run, "old"), (changed, "new")):

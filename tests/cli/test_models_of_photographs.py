@@ -9,7 +9,9 @@ import pycolmap
 import pytest
 from PIL import Image, ImageOps
 
+from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.dataset import load_dataset_model
+from octasplat.engine.dataset.views_file import read_views, write_views
 from octasplat.engine.runs.run_folder import has_photographs_of_run, run_viewpoints
 
 
@@ -90,3 +92,12 @@ def test_photographs_of_run_elsewhere_have_its_poses(posed_run, run):
     moved = run_viewpoints(posed_run, scene=run.scene)
     for mine, theirs in zip(kept.views, moved.views, strict=True):
         np.testing.assert_allclose(mine.origin_world, theirs.origin_world)
+
+
+def test_photographs_of_run_in_their_world_before_a_transform_are_refused(posed_run, others, run):
+    shutil.rmtree(posed_run / "poses")
+    views = read_views(posed_run / "views.json")
+    write_views(posed_run / "views.json", views.transformed(1.0, np.eye(3), np.array([0.0, 0.0, 9.0])))
+    with pytest.raises(DatasetError, match=r"have other poses than the scene of .* was made or moved with"):
+        run_viewpoints(posed_run, scene=run.scene)
+    assert len(run_viewpoints(posed_run, scene=others).views) == 8  # which may stand where they like

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from octasplat.engine.core.errors import CancelledError
+from octasplat.engine.core.errors import CancelledError, ConfigError
 from octasplat.engine.core.events import CheckpointWritten, Event, ImagesSaved, PhaseProgress
 from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.registry import operation
+from octasplat.engine.operations.relight import RelightRequest
 from octasplat.engine.operations.render import RenderRequest
 from octasplat.engine.render.environment_files import write_environment
 from octasplat.engine.render.image_files import read_image
@@ -184,8 +185,9 @@ def test_relight_job_and_command_of_one_request_give_the_same_bytes(
 
 
 def test_stage_init_job_matches_command(run, octasplat, tmp_path):
-    done = octasplat("stage", "init", run.output, "-o", tmp_path / "stage.toml")
+    done = octasplat("stage", "init", run.output, "--up", "x", "-o", tmp_path / "stage.toml")
     assert done.exit_code == 0 and "up is" in done.output, done.output
+    assert "(up) goes with a file" in done.stderr
     results = results_of("stage-init", run.output, tmp_path / "attempt", {})
     assert contents(results) == {"stage.toml": (tmp_path / "stage.toml").read_bytes()}
 
@@ -316,10 +318,35 @@ def test_numbered_images_are_gone_on_with_for_the_same_views_only(run, octasplat
     assert octasplat("render", run.output, *same, "-o", frames, "--resume").exit_code == 0
 
 
+@pytest.mark.parametrize("verb", ["render", "relight"])
+def test_images_that_move_are_gone_on_with_in_the_same_order_only(shiny_run, tmp_path, verb):
+    """Keys and turns count images, so that the same photographs in another order are other images."""
+    names, images = [view.name for view in run_viewpoints(shiny_run).views][:3], []
+    options: dict[str, object] = {"source": shiny_run, "output": tmp_path / "views", "max_side": 16}
+    if verb == "relight":
+        options |= {"environments": (shiny_run / "environment.exr",), "spin": True}
+        options |= {"integrator": "path", "samples": 1}
+    else:
+        keys = [{"frame": frame, "position": [0, -frame, 0]} for frame in range(3)]
+        lamp = {"kind": "point", "position": [0, 0, 0], "intensity": 1, "keys": keys}
+        options["stage"] = {"lights": [lamp], "integrator": {"samples": 1}}
+    request = {"render": RenderRequest, "relight": RelightRequest}[verb]
+    with pytest.raises(CancelledError):
+        operation(verb).run(
+            request(photographs=names, **options),
+            progress=images.append,
+            should_stop=lambda: any(isinstance(event, ImagesSaved) for event in images),
+        )
+    assert len(list((tmp_path / "views").glob("*.png"))) == 1
+    with pytest.raises(ConfigError, match="another render"):
+        operation(verb).run(request(photographs=names[::-1], resume=True, **options))
+
+
 def test_options_without_effect_on_cameras_are_warned_of(run, octasplat, tmp_path):
     one = ("--turntable", "--frames", 1, *SIZE_WORDS)
-    done = octasplat("render", run.output, *one, "--max-side", 16, "--fps", 5, "-o", tmp_path / "one.png")
-    assert done.exit_code == 0, done.output
+    vain = ("--max-side", 16, "--fps", 5, "--up", "x")
+    done = octasplat("render", run.output, *one, *vain, "-o", tmp_path / "one.png")
+    assert done.exit_code == 0 and "(up) goes with a file" in done.stderr, done.output
     assert "(max_side) goes with views of photographs" in done.stderr and "(fps) goes with" in done.stderr
     done = octasplat("render", run.output, "--views", "held-out", "--fov", 20, "-o", tmp_path / "views")
     assert done.exit_code == 0 and "(fov_y_degrees) goes with" in done.stderr, done.output

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.core.local_origin import NO_ORIGIN, vertices_about
+from octasplat.engine.core.local_origin import NO_ORIGIN, origin_after, vertices_about
 from octasplat.engine.files import ExportOptions, export_scene, read_mesh, read_metadata, read_scene
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.engine.gaussians.scene_metadata import SceneMetadata
@@ -105,6 +105,15 @@ def test_transform_to_and_from_the_origin_keeps_every_digit(octasplat, far, tmp_
     np.testing.assert_array_equal(read_scene(near)[0].means_world, read_scene(far)[0].means_world)
     assert octasplat("transform", near, "--translate", *map(str, ORIGIN), "-o", back).exit_code == 0
     np.testing.assert_allclose(user_positions(back), user_positions(far), atol=1e-6)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_gaussians_in_one_place_keep_their_digits(count: int) -> None:
+    place = np.tile(np.float32([0.3, 0.1, 0.2]), (count, 1))
+    moved, back = np.eye(4), np.eye(4)
+    moved[:3, 3], back[:3, 3] = (0.25, 0.0, 0.0), np.negative(ORIGIN)
+    assert origin_after(moved, place, ORIGIN) == (ORIGIN[0] + 0.25, *ORIGIN[1:])
+    assert origin_after(back, place, ORIGIN) == origin_after(moved, place, NO_ORIGIN) == NO_ORIGIN
 
 
 def test_merge_brings_scenes_of_other_origins_together(octasplat, far, make_scene, tmp_path) -> None:

@@ -72,6 +72,11 @@ def test_training_views_tell_whether_fit_or_photographs_lack(
     training: float, held_out: float, words: str
 ) -> None:
     assert words in told(view("a", held_out), training_psnr=training)
+    # of views that may have been trained on, the difference says nothing
+    seen = advise(
+        [view("a", held_out)], {}, training_psnr=training, learns_exposure=False, are_held_out=False
+    )
+    assert seen == ()
 
 
 def test_detail_is_that_of_fine_structure() -> None:

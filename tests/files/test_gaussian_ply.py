@@ -67,14 +67,18 @@ def test_gaussian_ply_metadata_in_comments_round_trips(make_gaussians: Make, tmp
     assert read_metadata(path) == read_metadata(tmp_path) == facts
     write_gaussian_ply(make_gaussians(3), path)
     assert read_metadata(path) == SceneMetadata()
+    (tmp_path / "scene.splat").write_bytes(bytes(32))
     assert read_metadata(tmp_path / "scene.splat") == SceneMetadata()
 
 
-def test_gaussian_ply_non_numeric_metadata_is_refused(make_gaussians: Make, tmp_path: Path) -> None:
+@pytest.mark.parametrize("text", ["close", "nan", "inf"])
+def test_gaussian_ply_non_numeric_metadata_is_refused(
+    make_gaussians: Make, tmp_path: Path, text: str
+) -> None:
     path = tmp_path / "scene.ply"
     write_gaussian_ply(make_gaussians(3), path, facts=SceneMetadata(near_world=0.125))
-    path.write_bytes(path.read_bytes().replace(b"near_world 0.125", b"near_world close"))
-    with pytest.raises(SceneFileError, match="near_world is 'close', which is no number"):
+    path.write_bytes(path.read_bytes().replace(b"near_world 0.125", f"near_world {text}".encode()))
+    with pytest.raises(SceneFileError, match=f"near_world is '{text}', which is no number"):
         read_metadata(path)
 
 

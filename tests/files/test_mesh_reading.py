@@ -174,6 +174,34 @@ def test_glb_node_with_a_matrix(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("mode", "triangles"),
+    [(4, []), (5, [[0, 1, 2], [1, 3, 2], [2, 3, 4]]), (6, [[1, 2, 0], [2, 3, 0], [3, 4, 0]])],
+    ids=["neither", "strip", "fan"],
+)
+def test_glb_strips_and_fans_are_read(tmp_path: Path, mode: int, triangles: list[list[int]]) -> None:
+    positions = np.arange(15, dtype="<f4")
+    document, _ = triangle_document(
+        meshes=[
+            {
+                "primitives": [
+                    {"attributes": {"POSITION": 0}, "mode": mode, **({} if triangles else {"indices": 1})}
+                ]
+            }
+        ],
+        nodes=[{"mesh": 0}],
+        accessors=[
+            {"bufferView": 0, "componentType": 5126, "count": 5, "type": "VEC3"},
+            {"bufferView": 0, "byteOffset": 60, "componentType": 5123, "count": 3, "type": "SCALAR"},
+        ],
+        bufferViews=[{"buffer": 0, "byteLength": 68}],
+        buffers=[{"byteLength": 68}],
+    )
+    binary = positions.tobytes() + np.array([0, 2, 4, 0], "<u2").tobytes()
+    found = read_mesh(glb(tmp_path, document, binary)).triangles
+    np.testing.assert_array_equal(found, triangles or [[0, 2, 4]])
+
+
+@pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"extensionsUsed": ["KHR_draco_mesh_compression"]}, "without compression"),

@@ -9,7 +9,8 @@ import pytest
 
 from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.core.errors import ConfigError, SceneFileError
-from octasplat.engine.files import ExportOptions, export_scene, glb_container
+from octasplat.engine.edit.mesh_to_gaussians import recover_gaussians
+from octasplat.engine.files import ExportOptions, export_scene, glb_container, read_mesh, read_scene
 from octasplat.engine.files.kd_split import kd_split
 from octasplat.engine.files.octagon_glb_layout import OPAQUE_CUTOFF
 from octasplat.engine.files.textures import radial_alpha
@@ -216,6 +217,12 @@ def test_large_scene_is_split_into_files(
     assert [part.json["asset"]["extras"]["octasplat_part"] for part in parts] == [[1, 3], [2, 3], [3, 3]]
     assert all(part.json["asset"]["extras"]["octasplat_gaussians"] == 5000 for part in parts)
     assert "octasplat_part" not in whole.json["asset"]["extras"]
+    back, report = read_scene(written[1])
+    assert len(back) < 5000
+    assert any("It is part 2 of the 3 files" in note for note in report.notes)
+    assert not any("fainter" in note for note in report.notes)
+    with pytest.raises(SceneFileError, match="is part 2 of the 3 files of its scene"):
+        recover_gaussians(scene, read_mesh(written[1]), written[1])
     together = [arrays for part in parts for arrays in part.primitives()]
     for ours, expected in zip(together, whole.primitives(), strict=True):
         for name in expected:

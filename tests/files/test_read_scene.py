@@ -5,10 +5,20 @@ import pytest
 
 from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.core.events import Event, PhaseFinished, PhaseStarted
-from octasplat.engine.files import Importer, importer_for, importers, read_scene, register
+from octasplat.engine.files import (
+    ExportOptions,
+    Importer,
+    export_scene,
+    importer_for,
+    importers,
+    read_metadata,
+    read_scene,
+    register,
+)
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.engine.gaussians.flattening import GaussianCloud
 from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.scene_metadata import SceneMetadata
 
 
 @pytest.fixture
@@ -28,11 +38,16 @@ def test_formats_are_found_by_themselves_and_have_names_of_their_own() -> None:
         register(Importer("gaussians", ("*.x",), "another", importers()[0].read))
 
 
-@pytest.mark.parametrize("name", ["scene.ply", "scene.splat", "scene.data"])
-def test_read_scene_detects_format_by_content(gaussians: FlatGaussians, tmp_path: Path, name: str) -> None:
-    write_gaussian_ply(gaussians, tmp_path / "a.ply")
-    (tmp_path / "a.ply").rename(tmp_path / name)
-    assert importer_for(tmp_path / name).name == "gaussians"
+@pytest.mark.parametrize("written", ["a.ply", "a.splats.glb"])
+@pytest.mark.parametrize("name", ["scene.ply", "scene.splat", "scene.data", "scene.glb"])
+def test_read_scene_detects_format_by_content(
+    gaussians: FlatGaussians, tmp_path: Path, written: str, name: str
+) -> None:
+    facts = SceneMetadata(origin_world=(512_345.0, 5_403_210.0, 310.0))
+    export_scene(gaussians, tmp_path / written, ExportOptions(facts=facts))
+    (tmp_path / written).rename(tmp_path / name)
+    assert importer_for(tmp_path / name).name == ("gaussians" if written == "a.ply" else "khr-glb")
+    assert read_metadata(tmp_path / name) == facts
     back, report = read_scene(tmp_path / name)
     np.testing.assert_array_equal(back.sh, gaussians.sh)
     assert (report.count, report.sh_degree, report.flattened, report.dropped) == (30, 1, 0, 0)

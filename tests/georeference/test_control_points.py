@@ -105,6 +105,17 @@ def test_gcp_list_gives_the_similarity(scene, tmp_path, head):
     assert found.residuals.used == 5 and found.residuals.rmse_m < 1e-6
 
 
+def test_points_called_as_photographs_take_none_from_marks(scene, tmp_path):
+    views = load_dataset_model(scene).views
+    text = gcp_list(scene, apply(truth_matrix(), POINTS), "local")
+    for k, view in enumerate(views[: len(POINTS)]):
+        text = text.replace(f"gcp{k}", Path(view.name).stem)
+    # spelt otherwise than the files are, which the points must not make ambiguous
+    (scene / "gcp_list.txt").write_text(text.replace(Path(views[0].name).suffix, ".tif"))
+    found = find(scene, tmp_path)
+    assert found.residuals.given == found.residuals.used == 5 and found.residuals.rmse_m < 1e-6
+
+
 def test_csv_gives_the_similarity_whatever_the_photographs_size(scene, tmp_path):
     ground = apply(truth_matrix(), POINTS)
     (scene / "targets.csv").write_text(csv_text(scene, ground, "# local metres"))

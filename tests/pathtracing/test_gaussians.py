@@ -26,7 +26,7 @@ from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.render.renderer import render_rays
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import TraceSettings
-from tests.support.light_scenes import camera, psnr
+from tests.support.light_scenes import camera, psnr, table_with_a_box
 
 PLAIN = Integrator(samples=1, max_depth=6, roulette_depth=64, anti_aliasing=False)
 
@@ -293,6 +293,18 @@ def test_hidden_environment_is_visible_in_mirror(tmp_path: Path) -> None:
     stage = emissive(ball, environment=Environment(file="sky.exr", visible=False))
     shown = picture(stage, VIEW, cloud(1, centre=(9, 9, 9)), tmp_path)
     assert shown[0, 0, 0] == 0 and abs(shown[18, 24, 0] - 1.055 * 0.7 ** (1 / 2.4) + 0.055) < 1e-3
+
+
+@pytest.mark.parametrize("clamp", [None, 0.5])
+def test_clamp_limits_what_matt_surfaces_see_of_lit_gaussians(clamp: float | None) -> None:
+    board = StageMesh(shape="plane", position=(0, 0.6, 0), scale=3, material=Diffuse(color_srgb=(1, 1, 1)))
+    lamp = PointLight(position=(0, 0.3, 0), intensity=5, lights_meshes=False)
+    numbers = Integrator(samples=1, max_depth=1, clamp=clamp)
+    lit = StageGaussians(light="relit", ambient=0.0)
+    stage = Stage(gaussians=(lit,), meshes=(board,), lights=(lamp,), integrator=numbers)
+    view = camera((0, 0.1, -3), (0, 0.6, 0), (16, 8), 20)
+    brightest = srgb_to_linear(picture(stage, view, table_with_a_box()).max(keepdims=True)).max()
+    assert (brightest > 0.9) if clamp is None else (brightest <= clamp + 1e-4)
 
 
 def test_gaussian_render_is_independent_of_threads() -> None:

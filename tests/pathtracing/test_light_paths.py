@@ -208,6 +208,48 @@ def test_light_of_a_point_goes_straight_through_a_pane(tmp_path: Path) -> None:
     np.testing.assert_allclose(seen.mean(axis=(0, 1)), 0.5 * 0.96**2 * np.exp([-0.5, 0, 0]), rtol=1e-4)
 
 
+def absorbing(height: float, half: float) -> StageMesh:
+    """A slab of index 1 that absorbs, its middle at a height over the floor."""
+    material = Glass(ior=1.0, absorption=(0.1, 0.1, 0.1))
+    return StageMesh(shape="cube", position=(0, -height, 0), scale=(8, half, 8), material=material)
+
+
+GAUZE = StageMesh(shape="plane", position=(0, -5, 0), scale=3, material=Diffuse(opacity=0.5))
+
+
+@pytest.mark.parametrize(
+    ("meshes", "height", "side", "left"),
+    [
+        ((absorbing(5, 4),), 5, 0, np.exp(-0.4)),
+        ((absorbing(5, 4), GAUZE), 20, 0, 0.5 * np.exp(-0.8)),
+        ((absorbing(0, 8),), 5, 0, np.exp(-0.5 - 0.8)),
+        ((absorbing(0, 8),), 5, 2, np.exp(-0.5 - 0.8)),
+        (tuple(absorbing(2 + k, 0.25) for k in range(12)), 20, 0, np.exp(-0.6)),
+    ],
+    ids=["lamp-inside", "gauze-inside", "both-inside", "area-and-floor-inside", "many-slabs"],
+)
+def test_light_of_lamps_is_absorbed_on_all_of_its_way_through_glass(
+    meshes: tuple[StageMesh, ...], height: float, side: float, left: float
+) -> None:
+    light: PointLight | RectangleLight = PointLight(position=(0, -height, 0), intensity=np.pi * height**2)
+    if side:
+        light = RectangleLight(
+            position=(0, -height, 0), direction=(0, 1, 0), width=side, height=side, radiance=1, visible=False
+        )
+    floor = StageMesh(shape="plane", scale=3, material=Diffuse(color_srgb=WHITE))
+    numbers = Integrator(samples=4, max_depth=2, anti_aliasing=False)
+    # below what hangs in the air, or above what the floor lies in
+    eye = -0.9 if meshes[0].position[1] else -9.0
+    view = camera((0.01, eye, 0), (0, 0, 0), (2, 2), 0.1)
+    seen = [
+        film_of(Stage(gaussians=(), meshes=things, lights=(light,), integrator=numbers), view)
+        .image()
+        .rgb_linear.mean()
+        for things in ((floor, *meshes), (floor,))
+    ]
+    assert seen[0] / seen[1] == pytest.approx(left, rel=0.01)
+
+
 def test_open_glass_and_camera_inside_glass_are_refused(tmp_path: Path) -> None:
     ball = StageMesh(shape="sphere", material=Glass())
     meshes = compile_meshes(Stage(gaussians=(), meshes=(ball,)), tmp_path)

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 from scipy.stats import chi2
 
@@ -54,6 +55,9 @@ def test_rectangle_light_back_side_is_black() -> None:
 def test_points_fall_off_with_the_square_and_directional_lights_not() -> None:
     point = build_light_arrays((PointLight(position=(0, 0, 2), intensity=8.0),), UP)
     sun = build_light_arrays((DirectionalLight(direction=(1, 0, -1), irradiance=2.0),), UP)
+    # A ball that is far and small, as a sun given by its place, lights as a point does.
+    ball = build_light_arrays((PointLight(position=(0, 0, 2e7), intensity=8e14, radius=2.0),), UP)
+    np.testing.assert_allclose(irradiance(sample_lights(ball, np.zeros((4, 3)), stratified(2))), 2.0)
     np.testing.assert_allclose(irradiance(sample_lights(point, np.zeros((4, 3)), stratified(2))), 2.0)
     np.testing.assert_allclose(
         irradiance(sample_lights(sun, np.full((4, 3), 9.0), stratified(2))), np.sqrt(2)
@@ -172,6 +176,37 @@ def test_environment_odd_pixels_are_replaced_and_told(tmp_path: Path) -> None:
         write_exr(tmp_path / f"{name}.exr", {"R": light, "G": light, "B": light})
         read_environment(tmp_path / f"{name}.exr", told.append)
         assert len(told) == 1 and sentence in told[0]
+
+
+@pytest.mark.parametrize("axes", ["-Y +X", "-Y -X", "+Y -X", "+Y +X", "+X -Y", "+X +Y", "-X +Y", "-X -Y"])
+def test_environment_is_turned_as_its_head_says(tmp_path: Path, axes: str) -> None:
+    upright = np.arange(1, 9, dtype=np.uint8).reshape(2, 4) * 16
+    # Y is up and X to the right: the file tells which way its lines, and the pixels of each, go
+    stored = upright[:: 1 if "-Y" in axes else -1, :: 1 if "+X" in axes else -1]
+    stored = stored.T if axes[1] == "X" else stored
+    lines, pixels = (f"{axis} {count}" for axis, count in zip(axes.split(), stored.shape, strict=True))
+    head = f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\nEXPOSURE=2\n\n{lines} {pixels}\n"
+    rgbe = np.stack([stored, stored, stored, np.full_like(stored, 128 + 8)], axis=-1)
+    (tmp_path / "map.hdr").write_bytes(head.encode() + rgbe.tobytes())
+    told: list[str] = []
+    np.testing.assert_array_equal(read_environment(tmp_path / "map.hdr", told.append)[..., 1], upright)
+    assert len(told) == 1 and "EXPOSURE" in told[0]
+
+
+def test_environment_is_the_display_window_of_an_exr(tmp_path: Path) -> None:
+    """What a compositor cut to what is not black, or rendered beyond the edges."""
+    whole = np.zeros((8, 16, 3), np.float32)
+    whole[3:5, 6:12] = np.arange(36, dtype=np.float32).reshape(2, 6, 3)
+    for top, left, bottom, right in ((3, 6, 5, 12), (-1, -2, 9, 18)):
+        spec = oiio.ImageSpec(right - left, bottom - top, 3, oiio.FLOAT)
+        spec.x, spec.y, spec.full_width, spec.full_height = left, top, 16, 8
+        part = np.pad(whole, ((2, 2), (2, 2), (0, 0)), constant_values=9.0)[
+            top + 2 : bottom + 2, left + 2 : right + 2
+        ]
+        output = oiio.ImageOutput.create(str(tmp_path / "part.exr"))
+        assert output.open(str(tmp_path / "part.exr"), spec) and output.write_image(part.copy())
+        output.close()
+        np.testing.assert_array_equal(read_environment(tmp_path / "part.exr"), whole)
 
 
 def test_environment_file_round_trips(tmp_path: Path) -> None:

@@ -121,6 +121,15 @@ def same_as(folder: Path, file: str, material: Material, twin: str = "twin.obj")
     return found
 
 
+def test_ball_texture_goes_round_it_without_a_twist_at_the_poles() -> None:
+    ball = primitive_shape("sphere")
+    assert ball.corner_uv is not None
+    x, y, z = ball.vertices[ball.faces].mean(axis=1).T
+    u, v = ball.corner_uv.mean(axis=1).T
+    off = (u - (0.5 + np.arctan2(x, z) / (2 * np.pi)) + 0.5) % 1 - 0.5
+    assert np.abs(off).max() < 0.01 and np.abs(v - np.arctan2(np.hypot(x, z), y) / np.pi).max() < 0.01
+
+
 def test_glb_material_and_textures_are_read(tmp_path: Path) -> None:
     cube = primitive_shape("cube")
     names = ("texture", "metallic_roughness_texture", "normal_texture", "emission_texture")
@@ -215,15 +224,23 @@ def test_glb_materials_in_mirrored_node(tmp_path: Path) -> None:
 def test_obj_materials_are_read_from_mtl(tmp_path: Path) -> None:
     cube = welded(primitive_shape("cube"))
     checks(tmp_path / "wood bark.png", 1)
+    checks(tmp_path / "bumps.png", 2, 0.3)
     (tmp_path / "things.mtl").write_text(
         "newmtl wood\nKd 0.5 0.5 0.5\nmap_Kd -s 1 1 1 C:\\art\\wood bark.png\nPr 0.4\nPm 0.0\n"
+        "norm -bm 0.3 -o 0 0.5 -clamp on -texres 64 bumps.png\n"
         "Pc 0.5\nPcr 0.2\n"
         "newmtl lamp\nKd 0 0 0\nKe 2 2 2\n"
     )
     write_obj(tmp_path / "twin.obj", cube)
     write_obj(tmp_path / "a.obj", cube, "mtllib things.mtl\nusemtl wood")
-    wood = MetallicRoughness(texture="wood bark.png", roughness=0.4, clear_coat=0.5, clear_coat_roughness=0.2)
+    wood = MetallicRoughness(
+        texture="wood bark.png", roughness=0.4, clear_coat=0.5, clear_coat_roughness=0.2,
+        normal_texture="bumps.png", normal_scale=0.3,
+    )  # fmt: skip
     same_as(tmp_path, "a.obj", wood)
+    said: list[str] = []
+    compile_meshes(Stage(meshes=(StageMesh(file="a.obj"),)), tmp_path, warn=said.append)
+    assert len(said) == 1 and "is not used: -o of norm, -clamp of norm, a clear coat" in said[0]
     text = (tmp_path / "a.obj").read_text().splitlines()
     text.insert(-6, "usemtl lamp")
     (tmp_path / "b.obj").write_text("\n".join(text) + "\n")
@@ -308,3 +325,51 @@ def test_unsupported_material_feature_warns(tmp_path: Path) -> None:
     said: list[str] = []
     compile_meshes(Stage(meshes=(StageMesh(file="a.glb"),)), tmp_path, warn=said.append)
     assert said == ["a.glb: of the material cloth is not used: KHR_materials_sheen, alphaMode DITHER."]
+
+
+@pytest.mark.parametrize(
+    ("material", "reach", "told"),
+    [
+        (
+            {"emissiveFactor": [1, 0, 0], "pbrMetallicRoughness": {"metallicRoughnessTexture": {"index": 0}}},
+            1,
+            "texture of metallic and roughness on glass, light of its own of glass",
+        ),
+        ({"pbrMetallicRoughness": {"metallicFactor": 0.25}}, 1, "metallic 0.25 of glass"),
+        ({"pbrMetallicRoughness": {"metallicFactor": 0.0}}, 1, None),
+        (
+            {"extensions": {"KHR_materials_ior": {"ior": 5}}},
+            1,
+            "an index of refraction of 5 (4 is taken)",
+        ),
+        (
+            {"normalTexture": {"index": 0, "scale": -1}, "extensions": {}},
+            1,
+            "the sign of the scale of its normal texture",
+        ),
+        ({"normalTexture": {"index": 0}, "extensions": {}}, 1, None),
+        (
+            {"normalTexture": {"index": 0}, "extensions": {}},
+            2,
+            "images that are mirrored or end at their edges, as texture coordinates go beyond",
+        ),
+    ],
+    ids=["glowing-glass", "metal", "plain-glass", "dense", "sunken", "within-image", "beyond-image"],
+)
+def test_what_a_glb_says_in_vain_is_told(
+    tmp_path: Path, material: dict[str, Any], reach: int, told: str | None
+) -> None:
+    glass = {"KHR_materials_transmission": {"transmissionFactor": 1.0}}
+    cube = primitive_shape("cube")
+    assert cube.corner_uv is not None
+    more = {"textures": [{"source": 0, "sampler": 0}], "samplers": [{"wrapS": 33648}]}
+    write_glb(
+        tmp_path / "a.glb",
+        replace(cube, corner_uv=reach * cube.corner_uv),
+        [{"name": "m", "extensions": glass} | material],
+        [checks(tmp_path / "a.png", 0)],
+        more=more,
+    )
+    said: list[str] = []
+    compile_meshes(Stage(meshes=(StageMesh(file="a.glb"),)), tmp_path, warn=said.append)
+    assert said == ([] if told is None else [f"a.glb: of the material m is not used: {told}."])

@@ -9,12 +9,16 @@ from click.testing import CliRunner, Result
 from octasplat.engine.core.color import linear_to_srgb
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.engine.operations.relight import RelightOptions
+from octasplat.engine.pathtracing.environment import EnvironmentMap, environment_frame
+from octasplat.engine.pathtracing.relighting import split_sum_relighter
 from octasplat.engine.render.environment_files import write_environment
 from octasplat.engine.render.image_files import read_image
+from octasplat.engine.shading.material_settings import MaterialSettings
+from octasplat.engine.trace.protocol import TraceSettings
 from octasplat.workers.cli.main import cli
 from tests.support.daily import some_daily
 from tests.support.image_channels import read_channels
-from tests.support.light_scenes import psnr, shiny_ball
+from tests.support.light_scenes import camera, psnr, shiny_ball
 
 SMALL = ("--turntable", "--frames", 2, "--width", 32, "--height", 24, "--threads", 2, "--samples", 16)
 
@@ -57,6 +61,21 @@ def test_white_furnace_of_white_metal(scene, tmp_path, by):
     inside = np.s_[9:15, 13:19]
     assert image["A"][inside].mean() > 0.98 and image["A"][0, 0] == 0
     assert image["R"][inside].mean() == pytest.approx(0.5, rel=0.03)
+
+
+@pytest.mark.parametrize("recipe", ["split_sum", "near_field", "ref_gaussian"])
+def test_white_mirror_shows_the_radiance_around_it_by_each_recipe(recipe, monkeypatch):
+    monkeypatch.setattr(split_sum_relighter, "ENVIRONMENT_HEIGHT_PX", 16)
+    ball = shiny_ball(400, 0.4, albedo=(1, 1, 1), metallic=1.0, roughness=0.1)
+    # rays begin so far off the coarse ball that it does not hide the environment from itself
+    relighter = split_sum_relighter.SplitSumRelighter(
+        ball, TraceSettings(), MaterialSettings(recipe=recipe, ray_bias=0.1), extent_world=1, threads=1
+    )
+    view = camera((0, 0, -2), (0, 0, 0), (4, 4), 5).rays()
+    for radiance in (0.25, 4.0):
+        around = np.full((8, 16, 3), radiance, np.float32)
+        relighter.set_environment(EnvironmentMap(around, environment_frame(np.array([0.0, -1.0, 0.0]))))
+        np.testing.assert_allclose(relighter.render(view).linear, radiance, rtol=0.02)
 
 
 @pytest.mark.exhaustive

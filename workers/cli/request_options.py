@@ -219,13 +219,20 @@ def _former_parameter(flag: str) -> str:
 
 
 def _by_new_flags(model: type[BaseModel], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what the user gave by field, also what was given by former flags, which is told."""
+    """Return what the user gave by field, also what was given by former flags, which is told.
+
+    Raises:
+        UsageError: one field is given by both flags.
+    """
     values = dict(given)
     for flag, name in _former_flags(model, model.model_fields).items():
         value = values.pop(_former_parameter(flag), None)
         if value is None or value == ():
             continue
-        notify_renamed({flag: option_name(model, name)})
+        present = option_name(model, name)
+        if values.get(name) not in (None, ()):
+            raise click.UsageError(f"{flag} is the former name of {present}; give one of the two.")
+        notify_renamed({flag: present})
         values[name] = value
     return values
 

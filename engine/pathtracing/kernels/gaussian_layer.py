@@ -40,6 +40,7 @@ from octasplat.engine.pathtracing.kernels.path_radiance import add_radiance, eva
 from octasplat.engine.pathtracing.kernels.sampler import uniform_pair
 from octasplat.engine.pathtracing.kernels.scatter import (
     FLAG_CLEAR,
+    FLAG_SCATTERED,
     LAYER_LIGHT_SAMPLE,
     LIGHT_CHOICE_SAMPLE,
     SHADOW_RAY_SCALE,
@@ -167,9 +168,14 @@ def _query_layer_light(
     taking = (relit if lights.lights_relit[l] else 0.0) + (additive if lights.adds_light[l] else 0.0)
     # a Lambertian surface with the layer's normal; a light in one direction has no density
     factor = taking * cosine / (math.pi * chance * (pdf if pdf > 0.0 else 1.0))
-    shadows.radiance_linear[k, 0] = g_r * l_r * factor
-    shadows.radiance_linear[k, 1] = g_g * l_g * factor
-    shadows.radiance_linear[k, 2] = g_b * l_b * factor
+    red, green, blue = g_r * l_r * factor, g_g * l_g * factor, g_b * l_b * factor
+    if paths.flags[p] & FLAG_SCATTERED:
+        most, clamp = max(red, green, blue), query.integrator.clamp
+        if most > clamp:
+            red, green, blue = red * clamp / most, green * clamp / most, blue * clamp / most
+    shadows.radiance_linear[k, 0] = red
+    shadows.radiance_linear[k, 1] = green
+    shadows.radiance_linear[k, 2] = blue
     if shadowed > MIN_COVERAGE and lights.takes_light[l]:
         # Only among the lights that take something is the shadow a mean.
         losing = shadowed / max(1.0 - no_shadow_probability(lights, x, y, z), 1e-6)
@@ -223,6 +229,7 @@ def intersect_gaussian_layers(
             first_pair = CAMERA_SAMPLE_PAIRS + depth * SAMPLE_PAIRS_PER_BOUNCE
             normal = layer.normals[k, 0], layer.normals[k, 1], layer.normals[k, 2]
             query = LightQuery(lights, integrator, shadows, k)
+            shadows.medium_ids[k] = paths.medium_ids[p]
             if scene.any_nested:
                 copy_media(paths.media[p], shadows.media[k])
             _query_layer_light(paths, p, first_pair, point, normal, (g_r, g_g, g_b), shares, query)

@@ -148,6 +148,7 @@ def intersect_gaussian_surfaces(
         metallic, roughness = min(features[k, METALLIC] * part, 1.0), min(features[k, ROUGHNESS] * part, 1.0)
         bsdf = Bsdf(color, metallic, roughness, IOR, BURLEY, False, 0.0, 0.0)
         normal, query = (n_x, n_y, n_z), LightQuery(lights, integrator, shadows, k)
+        shadows.medium_ids[k] = paths.medium_ids[p]
         if scene.any_nested:
             copy_media(paths.media[p], shadows.media[k])
         scatter_path(p, samples, paths, False, SurfacePoint(point, normal, normal), bsdf, tables, query)

@@ -193,8 +193,10 @@ def scatter_rough_glass(
             factor = gain * value / (l_pdf + pdf if lights.is_hittable[l] else l_pdf)
         if value > 0.0:
             through = i_z < 0.0
-            if through and is_nested(materials, m):
-                cross_surface(shadows.media[k], m, glass.is_entering)
+            if through:
+                shadows.medium_ids[k] = glass.medium
+                if is_nested(materials, m):
+                    cross_surface(shadows.media[k], m, glass.is_entering)
             # nothing is in the way of what casts no shadows
             distance = distance if lights.casts_shadows[l] else 0.0
             radiance = (

@@ -174,7 +174,8 @@ def emitter_hit_pdf(
 def _one_minus_cosine(squared_sine: float) -> float:
     """Return 1 - cos of an angle below 90 degrees, without cancellation where it is small."""
     squared_sine = min(squared_sine, 1.0)
-    return max(squared_sine / (1.0 + math.sqrt(1.0 - squared_sine)), 1e-12)
+    # only what cannot be divided by is kept off: a ball may be as far and as small as it likes
+    return max(squared_sine / (1.0 + math.sqrt(1.0 - squared_sine)), 1e-60)
 
 
 @njit_no_refcount(fastmath={"contract"})

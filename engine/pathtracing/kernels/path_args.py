@@ -82,6 +82,7 @@ class ShadowRayArrays(NamedTuple):
         passes_glass: whether glass in the way lets light straight through, as no path could find it
             otherwise.
         media: glass with a priority that the points are inside.
+        medium_ids: material that the points are in, -1 for air.
     """
 
     origins_world: Float32[np.ndarray, "n 3"]
@@ -91,6 +92,7 @@ class ShadowRayArrays(NamedTuple):
     occluded_radiance_linear: Float32[np.ndarray, "n 3"]
     passes_glass: Bool[np.ndarray, " n"]
     media: Int32[np.ndarray, "n d"]
+    medium_ids: Int32[np.ndarray, " n"]
 
 
 class SurfaceInteractions(NamedTuple):
@@ -274,7 +276,7 @@ def allocate_shadow_rays(count: int) -> ShadowRayArrays:
     return ShadowRayArrays(
         np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32), np.zeros(count, np.float32),
         np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32), np.zeros(count, np.bool_),
-        allocate_media(count),
+        allocate_media(count), np.full(count, -1, np.int32),
     )  # fmt: skip
 
 

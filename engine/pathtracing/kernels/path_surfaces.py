@@ -265,6 +265,7 @@ def shade_surfaces(first: int, last: int, scratch: PathScratch, bounce: Bounce) 
         ):
             continue
         query = LightQuery(lights, integrator, shadows, k)
+        shadows.medium_ids[k] = paths.medium_ids[p]
         if scene.any_nested:
             copy_media(paths.media[p], shadows.media[k])
         _scatter_at_material(

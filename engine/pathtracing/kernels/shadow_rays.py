@@ -9,6 +9,7 @@ from octasplat.engine.core.compilation import kernel
 from octasplat.engine.pathtracing.kernels.cutouts import MAX_CUTOUTS, eval_opacity, restart_distance
 from octasplat.engine.pathtracing.kernels.kernel_args import MaterialArrays, MeshQueries, SurfaceArrays
 from octasplat.engine.pathtracing.kernels.nested_glass import (
+    AIR,
     cross_surface,
     index_of,
     is_hidden,
@@ -32,8 +33,6 @@ from octasplat.engine.trace.kernels.triangles import (
     any_hits,
     closest_hits,
 )
-
-MAX_GLASS_SURFACES = 16
 
 
 @njit_no_refcount(forceinline=True)
@@ -105,6 +104,20 @@ def _attenuate_by_medium(
 
 
 @njit_no_refcount(forceinline=True)
+def _attenuate_at_start(
+    materials: MaterialArrays,
+    shadows: ShadowRayArrays,
+    scratch: PathScratch,
+    count: int,
+    transmittance: Float32[np.ndarray, "n 3"],
+) -> None:
+    """Attenuate ``count`` rows that meet no glass by what they begin in."""
+    for i in range(count):
+        k = scratch.rows[i]
+        _attenuate_by_medium(materials, shadows.medium_ids[k], float(shadows.t_max[k]), k, transmittance)
+
+
+@njit_no_refcount(forceinline=True)
 def _cross_nested_glass(
     materials: MaterialArrays,
     m: int,
@@ -148,17 +161,21 @@ def _trace_filters(
 
     That is glass, by Fresnel, tint and Beer's law, and what has holes, by its opacity.
     """
+    # free here: where each ray met its last glass, and the glass without a priority that it is inside
+    last_glass, inside = scratch.t_ends, scratch.samples
     for k in range(BLOCK_SIZE):
-        scratch.t_starts[k] = 0.0
+        scratch.t_starts[k] = last_glass[k] = 0.0
     for i in range(count):
         scratch.rows[i] -= first
+        medium = shadows.medium_ids[first + scratch.rows[i]]
+        inside[scratch.rows[i]] = medium if medium >= 0 and not is_nested(materials, medium) else AIR
     # Starts are kept by the row's place in the block.
     rays = TriangleRays(
         shadows.origins_world[first:], shadows.directions_world[first:], scratch.t_starts,
         shadows.t_max[first:], scratch.rows,
     )  # fmt: skip
     met = TriangleHitArrays(scratch.distances, scratch.faces, scratch.barycentrics)
-    for _ in range(MAX_CUTOUTS if queries.any_cutout else MAX_GLASS_SURFACES):
+    for _ in range(MAX_CUTOUTS):
         closest_hits(queries.closest_hit_filter, rays, 0, count, False, scratch.embree, met)
         left = 0
         for i in range(count):
@@ -166,10 +183,10 @@ def _trace_filters(
             k = first + place
             # rays that meet no more of it leave the list with what they have
             if scratch.faces[i] < 0:
-                length = float(shadows.t_max[k] - scratch.t_starts[place])
-                _attenuate_by_medium(
-                    materials, medium_of(materials, shadows.media[k]), length, k, transmittance
-                )
+                length = max(float(shadows.t_max[k] - last_glass[place]), 0.0)
+                medium = medium_of(materials, shadows.media[k])
+                medium = inside[place] if medium < 0 else medium
+                _attenuate_by_medium(materials, medium, length, k, transmittance)
                 continue
             face = queries.filter_faces[scratch.faces[i]]
             m = surfaces.material_ids[face]
@@ -178,7 +195,8 @@ def _trace_filters(
                 n_x, n_y, n_z = face_normal(surfaces.corners_world[face])
                 d = shadows.directions_world[k]
                 cosine = n_x * d[0] + n_y * d[1] + n_z * d[2]
-                length = float(t - scratch.t_starts[place])
+                length = float(t - last_glass[place])
+                last_glass[place] = restart_distance(t)
                 if is_nested(materials, m):
                     _cross_nested_glass(
                         materials, m, cosine, length, passes_rough_glass, shadows, k, transmittance
@@ -189,6 +207,7 @@ def _trace_filters(
                     )
                     # Out of the glass: what it absorbed on the way.
                     length = length if cosine > 0.0 else 0.0
+                    inside[place] = m if cosine <= 0.0 else AIR
                     for channel in range(3):
                         passed = math.exp(-materials.absorption[m, channel] * length)
                         transmittance[k, channel] *= share * materials.colors_linear[m, channel] * passed
@@ -239,6 +258,8 @@ def shadow_transmittance(
             _trace_filters(
                 queries, surfaces, materials, shadows, start, scratch, count, False, transmittance
             )  # fmt: skip
+        else:
+            _attenuate_at_start(materials, shadows, scratch, count, transmittance)
         count = _select_shadow_rays(shadows, start, end, True, scratch.rows)
         count = _trace_occlusion(queries.any_hit_opaque, shadows, scratch, count, transmittance)
         if queries.closest_hit_filter.scene != 0:

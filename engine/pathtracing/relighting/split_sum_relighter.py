@@ -68,7 +68,7 @@ class SplitSumRelighter:
         """Set the environment light."""
         other = self._radiance is not environment.radiance_linear
         if other:
-            self._shading.light.set_radiance(environment.radiance_linear)
+            self._shading.relight_with(environment.radiance_linear)
             self._radiance = environment.radiance_linear
         if other or not np.array_equal(self._shading.frame, environment.frame):
             self._shading.frame = environment.frame

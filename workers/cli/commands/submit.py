@@ -168,6 +168,8 @@ def derive(
 
     _check_output(output, wait=wait)
     if former_on is not None:
+        if other_dataset is not None:
+            raise click.UsageError("--on is the former name of --other-dataset; give one of the two.")
         notify_renamed({"--on": "--other-dataset"})
     files = [_parse_file_option(text) for text in given["files"]]
     with connected(server, awaits_start=wait) as api:
