@@ -341,10 +341,11 @@ def ray_cost_growth(train: TrainConfig, gaussians: int, seen: int) -> float:
 def _ray_cpu_seconds(train: TrainConfig, gaussians: int) -> float:
     if train.ray_patch_rays == 1:
         return _SINGLE_RAY_CPU_SECONDS
-    if train.materials.learn:
-        return float(_MATERIAL_RAY_CPU_SECONDS * (gaussians / _MATERIAL_GAUSSIANS) ** _FAR_RAY_POWER)
     near, far = min(gaussians, _FITTED_GAUSSIANS) / 1e5, max(gaussians / _FITTED_GAUSSIANS, 1.0)
     seconds = max(_RAY_CPU_SECONDS * near**_RAY_POWER * far**_FAR_RAY_POWER, _LEAST_RAY_CPU_SECONDS)
+    if train.materials.learn:
+        lit = float(_MATERIAL_RAY_CPU_SECONDS * (gaussians / _MATERIAL_GAUSSIANS) ** _FAR_RAY_POWER)
+        return lit + float(seconds) if train.loss.edges else lit
     saved = _SHARED_SORT_SAVING * train.shared_sort_until if uses_shared_sort(train) else 0.0
     return float(seconds * (1 - saved))
 

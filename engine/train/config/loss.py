@@ -69,8 +69,8 @@ class LossWeights(Settings):
         f"depth; by default {DEPTH_MAP_WEIGHT} where the scene has depth maps. Lower it where they are "
         "rough.",
     )
-    edges: Annotated[float, Unit("weight"), EXPERIMENTAL] = Field(
-        0.0,
+    edges: Annotated[float | None, Unit("weight"), EXPERIMENTAL] = Field(
+        None,
         ge=0,
         description="Weight of the difference from the photographs of as many further rays as a batch has, "
         "which show harmonics, where they pass an edge; with materials alone. Thin parts and outlines come "

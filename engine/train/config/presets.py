@@ -13,6 +13,8 @@ FLIP_NORMAL_COS = 0.5
 """Cosine beyond which normals that point away are turned, where materials are learnt."""
 SHORT_TRAINING = 5000
 """Iterations of a preset without materials up to which those with them take larger steps and grow sooner."""
+SHORT_EDGE_WEIGHT = 1.0
+"""``loss.edges`` of such a training with materials."""
 SHORT_MATERIAL_RATES = {"mean": 0.05, "log_scale": 0.04, "albedo": 0.08, "metallic": 0.05, "roughness": 0.05}
 
 
@@ -45,7 +47,9 @@ def with_materials(config: TrainConfig) -> TrainConfig:
             ),
             "lr": config.lr.model_copy(update=rates),
             # Gaps under things that stand on a mirror would be filled with what looks like the reflection.
-            "loss": config.loss.model_copy(update={"free_space": 0.05}),
+            "loss": config.loss.model_copy(
+                update={"free_space": 0.05, "edges": SHORT_EDGE_WEIGHT if is_short else None}
+            ),
             "plane_sweep_init": False,
             "normal_neighbors": 10,
             "sh_degree": min(config.sh_degree, 1),

@@ -115,7 +115,7 @@ class TrainConfig(PhotographSettings, GaussianSettings, RaySettings):
             raise ValueError(
                 "loss.depth_normal compares neighbouring rays of windows: set ray_patch_rays to 64"
             )
-        if self.loss.edges > 0 and not self.materials.learn:
+        if self.loss.edges and not self.materials.learn:
             raise ValueError("loss.edges is for trainings with materials: set it to 0")
         if self.trace.sort != "ray":
             raise ValueError(

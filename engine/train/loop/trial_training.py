@@ -117,7 +117,13 @@ def material_gain_db(
     probe = draw_probe(dataset, indices, MATERIAL_PROBE_RAYS, color, np.random.default_rng(seed))
     found = []
     lit = with_materials(preset("fast"))
-    lit = lit.model_copy(update={"materials": lit.materials.model_copy(update={"recipe": recipe})})
+    lit = lit.model_copy(
+        update={
+            "materials": lit.materials.model_copy(update={"recipe": recipe}),
+            # Rays that show colors would say for materials what colors alone explain.
+            "loss": lit.loss.model_copy(update={"edges": None}),
+        }
+    )
     for base in (preset("fast"), lit):
         config = base.model_copy(update={**MATERIAL_TRIAL_SETTINGS, "background": background, "seed": seed})
         gaussians, shading = _train(

@@ -1,10 +1,10 @@
 """The term of the loss for edges in trainings with materials, by its gradients alone.
 
-With its reflected rays a ray with materials takes several times as long as one that shows harmonics. So a
-training with materials sees each pixel a few times only, and thin parts and outlines are not where they belong
-when it ends. Harmonics tell these apart as well. So further rays show harmonics, and where they pass an edge
-the difference from the photographs moves the Gaussians. Elsewhere it does not: harmonics explain reflections
-by Gaussians behind the surface.
+A ray with materials and what it reflects takes several times as long as one that shows harmonics. So a
+training with materials sees each pixel a few times only, and when it ends, thin parts and outlines are not yet
+where they belong. Harmonics tell a thing from what is behind it as well. So further rays show harmonics, and
+where they pass an edge the difference from the photographs moves the Gaussians. Elsewhere it does not:
+harmonics explain reflections by Gaussians behind the surface.
 """
 
 import numpy as np
@@ -40,6 +40,6 @@ def edge_gradient(batch: Batch, tracer: Tracer, weights: LossWeights) -> tuple[R
     background = batch.background_srgb
     render = result.rgb_srgb + result.transmittance[:, None] * background
     loss = pixel_loss(render, batch.target_srgb, batch.weight, l1=weights.l1, l2=weights.l2)
-    chosen = np.float32(weights.edges) * passes_edge(result).astype(np.float32)
+    chosen = np.float32(weights.edges or 0.0) * passes_edge(result).astype(np.float32)
     by_color: Float32[np.ndarray, "r 3"] = loss.gradient * chosen[:, None]
     return result.recording, TraceGradients(by_color, transmittance=by_color @ background)

@@ -108,7 +108,7 @@ class BatchOptions:
             ssim_patch_side_px=config.ssim_patch_side,
             visibility_ray_fraction=config.visibility_ray_fraction if config.loss.free_space > 0 else 0.0,
             reads_depths=bool(config.loss.depth),
-            has_edge_rays=config.loss.edges > 0 and config.materials.learn,
+            has_edge_rays=bool(config.loss.edges) and config.materials.learn,
         )
 
 
