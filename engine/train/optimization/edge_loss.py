@@ -1,9 +1,9 @@
 """The term of the loss for edges in trainings with materials, by its gradients alone.
 
 A ray with materials and what it reflects takes several times as long as one that shows harmonics. So a
-training with materials sees each pixel a few times only, and when it ends, thin parts and outlines are not yet
-where they belong. Harmonics tell a thing from what is behind it as well. So further rays show harmonics, and
-where they pass an edge the difference from the photographs moves the Gaussians. Elsewhere it does not:
+training with materials sees each pixel a few times only, and when it ends, thin parts and outlines are not
+yet where they belong. Harmonics tell a thing from what is behind it as well. So further rays show harmonics,
+and where they pass an edge the difference from the photographs moves the Gaussians. Elsewhere it does not:
 harmonics explain reflections by Gaussians behind the surface.
 """
 
