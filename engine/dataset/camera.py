@@ -1,6 +1,7 @@
 """Cameras of every COLMAP model, used as rays through pixels; images are never undistorted."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import pycolmap
@@ -129,4 +130,10 @@ class Camera:
 
     def project(self, points_cam: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 2"]:
         """Project points in camera coordinates to pixels; not-a-number where there is no projection."""
-        return np.array(self.to_pycolmap().img_from_cam(np.ascontiguousarray(points_cam)), dtype=np.float64)
+        return np.array(_projector(self).img_from_cam(np.ascontiguousarray(points_cam)), dtype=np.float64)
+
+
+@lru_cache(maxsize=4096)
+def _projector(camera: Camera) -> pycolmap.Camera:
+    """Return COLMAP's form of a camera to project with; making one takes as long as a thousand points."""
+    return camera.to_pycolmap()

@@ -41,6 +41,11 @@ def _depth_ranks(
 
 
 def _ranks(values: Float[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
-    from scipy.stats import rankdata  # takes a second, which processes that write no GLB do not need
-
-    return np.asarray(rankdata(values))
+    """Return the ranks from 1 on; equal values share the mean of theirs."""
+    order = np.argsort(values, kind="stable")
+    ordered = values[order]
+    starts = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
+    ends = np.append(starts[1:], len(values))
+    ranks = np.empty(len(values))
+    ranks[order] = np.repeat((starts + 1 + ends) / 2, ends - starts)
+    return ranks

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from octasplat.engine.shading.exposure_estimation import estimate_values, times_from_names
+from octasplat.engine.shading.kernels.exposure import ExposedRays, expose_rays, gather_exposure_gradients
 from octasplat.engine.shading.plain import PLAIN_SHADING
 from octasplat.engine.shading.protocol import (
     ShadedRayGradients,
@@ -79,11 +80,19 @@ class ExposureModel(WrapperModel):
         view = traced.view if self._fixed_view is None else self._fixed_view
         if view is None:
             return inner
-        gains, offsets = np.exp(self.log_gains)[view], self.offsets[view]
+        rgb = np.empty_like(inner.rgb_srgb)
         # offsets belong to what is covered: the background is not exposed
-        alpha = np.float32(1) - inner.transmittance
-        rgb = gains * inner.rgb_srgb + offsets * alpha[:, None]
+        expose_rays(self._exposed_rays(np.broadcast_to(view, len(rgb)), inner), rgb)
         return ShadedRays(rgb, inner.transmittance, inner, inner.layers)
+
+    def _exposed_rays(self, view: Int64[np.ndarray, " r"], inner: ShadedRays) -> ExposedRays:
+        return ExposedRays(
+            np.ascontiguousarray(view, np.int64),
+            np.exp(self.log_gains),
+            self.offsets,
+            np.ascontiguousarray(inner.rgb_srgb),
+            np.ascontiguousarray(inner.transmittance),
+        )
 
     def for_view(self, view: int) -> "ExposureModel":
         """Return the same model, exposing everything as one view; it shares the arrays and is not trained."""
@@ -121,16 +130,16 @@ class ExposureModel(WrapperModel):
         assert view is not None and isinstance(inner, ShadedRays), (
             "only views of the training are learnt from"
         )
-        gains = np.exp(self.log_gains)[view]
-        used, place = np.unique(view, return_inverse=True)
-        grad_rgb = grad.rgb_srgb
-        alpha = np.float32(1) - inner.transmittance
-        terms = np.concatenate([grad_rgb * gains * inner.rgb_srgb, grad_rgb * alpha[:, None]], axis=1)
-        sums = np.stack([np.bincount(place, terms[:, c], len(used)) for c in range(6)], axis=1)
-        grad_alpha = (grad_rgb * self.offsets[view]).sum(axis=1)
-        inner_grad = ShadedRayGradients(grad_rgb * gains, grad.transmittance - grad_alpha)
+        by_rgb, by_transmittance = np.empty_like(grad.rgb_srgb), grad.transmittance.copy()
+        sums, counts = np.empty((len(self.steps), 6)), np.empty(len(self.steps), np.int64)
+        gather_exposure_gradients(
+            self._exposed_rays(view, inner),
+            np.ascontiguousarray(grad.rgb_srgb), by_rgb, by_transmittance, sums, counts,
+        )  # fmt: skip
+        used = np.flatnonzero(counts)
+        inner_grad = ShadedRayGradients(by_rgb, by_transmittance)
         inner_gradients = self.inner.backward(traced, inner, inner_grad)
-        exposure_gradients = {"exposure.views": used, "exposure.sums": sums}
+        exposure_gradients = {"exposure.views": used, "exposure.sums": sums[used]}
         return ShadingGradients(
             inner_gradients.trace,
             inner_gradients.recorded_traces,

@@ -19,6 +19,10 @@ def test_draw_order_follows_majority():
     order, _ = shared_depth_order(points, np.array([front, front, back]))
     assert order.tolist() == [3, 2, 1, 0]
     ball = np.random.default_rng(0).standard_normal((500, 3))
+    # as far as each other: their ranks are the same, and their order stays
+    ring = np.array([[1.0, 0, 0], [0, 0, 3], [0, 1, 0], [-1, 0, 0]])
+    order, agreement = shared_depth_order(ring, np.zeros((1, 3)))
+    assert order.tolist() == [1, 0, 2, 3] and agreement == pytest.approx(1.0)
     around = 9 * ball[:40] / np.linalg.norm(ball[:40], axis=1, keepdims=True)
     assert abs(shared_depth_order(ball, around)[1]) < 0.3
 

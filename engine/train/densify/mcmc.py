@@ -12,6 +12,7 @@ from octasplat.engine.dataset.region import Region
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 from octasplat.engine.trace.protocol import GaussianGradients
 from octasplat.engine.train.config import McmcConfig
+from octasplat.engine.train.kernels.row_sums import add_to_rows
 from octasplat.engine.train.optimization.adam import Adam
 
 MAX_COPIES = 32
@@ -81,8 +82,8 @@ class McmcDensifier:
             return
         if len(self._errors) != count:
             self._reset_sums(count)  # other Gaussians than before: nothing is known of these
-        self._errors[gradients.ids] += gradients.error_sums
-        self._weights[gradients.ids] += gradients.weight_sums
+        add_to_rows(gradients.ids, gradients.error_sums, self._errors)
+        add_to_rows(gradients.ids, gradients.weight_sums, self._weights)
 
     def is_due(self, iteration: int) -> bool:
         """Return whether an interval has passed between start and stop; in rounds at the cap."""

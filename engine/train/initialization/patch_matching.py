@@ -12,6 +12,8 @@ STEP_PX = 2
 OFFSETS_PX = STEP_PX * np.array([[x, y] for x in (0, 1, -1) for y in (0, 1, -1)], np.int64)
 LEVEL_WEIGHT = 0.3
 """Weight of a difference in brightness against one in texture."""
+POINTS_PER_BLOCK = 1 << 15
+"""Points of patches at depths that are projected at a time."""
 
 
 @dataclass(frozen=True)
@@ -85,33 +87,49 @@ def draw_patches(
     )
 
 
-def patch_cost(
+def patch_costs(
     photographs: ExposedPhotographs,
     patches: PixelPatches,
-    depths: Float64[np.ndarray, " n"],
+    depths: Float64[np.ndarray, "n g"],
     neighbours: list[int],
-) -> Float64[np.ndarray, " n"]:
-    """Return how much patches, moved to depths, differ from what the neighbouring views show there."""
+) -> Float64[np.ndarray, "n g"]:
+    """Return how much each patch, moved to each of its depths, differs from what neighbouring views show."""
+    costs = np.empty(depths.shape)
+    # many patches at a time, as calls take time, and few enough for the cache
+    step = max(1, POINTS_PER_BLOCK // max(1, depths.shape[1] * len(OFFSETS_PX)))
+    for first in range(0, len(depths), step):
+        block = np.arange(first, min(first + step, len(depths)))
+        costs[block] = _block_costs(photographs, patches[block], depths[block], neighbours)
+    return costs
+
+
+def _block_costs(
+    photographs: ExposedPhotographs,
+    patches: PixelPatches,
+    depths: Float64[np.ndarray, "n g"],
+    neighbours: list[int],
+) -> Float64[np.ndarray, "n g"]:
     dataset = photographs.dataset
-    distances = depths[:, None] * patches.depth_factors
-    points = patches.origin_world + distances[:, :, None] * patches.directions_world
-    count, offsets = distances.shape
+    distances = depths[:, :, None] * patches.depth_factors[:, None]
+    points = patches.origin_world + distances[..., None] * patches.directions_world[:, None]
+    count, guesses, offsets = distances.shape
     # infinite where the other view does not show the whole patch
-    costs = np.full((len(neighbours), count), np.inf)
+    costs = np.full((len(neighbours), count * guesses), np.inf)
     for k, other in enumerate(neighbours):
         image_px, depth = project(dataset, other, points.reshape(-1, 3))
-        is_visible = (is_inside(dataset, other, image_px) & (depth > 0)).reshape(count, offsets)
+        is_visible = (is_inside(dataset, other, image_px) & (depth > 0)).reshape(-1, offsets)
         inside = np.flatnonzero(is_visible.all(axis=1))
         if not len(inside):
             continue
-        chosen = np.floor(image_px.reshape(count, offsets, 2)[inside]).astype(np.int64).reshape(-1, 2)
+        chosen = np.floor(image_px.reshape(-1, offsets, 2)[inside]).astype(np.int64).reshape(-1, 2)
         rgb, _, _ = photographs.pixels(np.full(len(chosen), other), chosen[:, 1], chosen[:, 0])
         differences = np.empty(len(inside))
-        patch_differences(patches.rgb_srgb, rgb.reshape(-1, offsets, 3), inside, LEVEL_WEIGHT, differences)
+        rows = inside // guesses
+        patch_differences(patches.rgb_srgb, rgb.reshape(-1, offsets, 3), rows, LEVEL_WEIGHT, differences)
         costs[k, inside] = differences
     costs.sort(axis=0)  # the better half counts: in the others the patch may be hidden
     used = costs[: max(1, (len(neighbours) + 1) // 2)]
-    return np.asarray(used.mean(axis=0))
+    return np.asarray(used.mean(axis=0)).reshape(count, guesses)
 
 
 def project(

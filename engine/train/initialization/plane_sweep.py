@@ -26,10 +26,9 @@ from octasplat.engine.dataset import Dataset
 from octasplat.engine.train.initialization.initial_background import InitialBackground
 from octasplat.engine.train.initialization.patch_matching import (
     ExposedPhotographs,
-    PixelPatches,
     draw_patches,
     is_inside,
-    patch_cost,
+    patch_costs,
     project,
 )
 from octasplat.engine.train.initialization.plane_sweep_points import (
@@ -216,11 +215,11 @@ def _lift_pixels(
     pixels_px = np.stack([patches.x + 0.5, patches.y + 0.5], axis=1)
     distances_px, nearest = cKDTree(projected_px[inside]).query(pixels_px, DEPTH_HYPOTHESES)
     suggested = depths[inside][nearest]
-    depth, cost = _best_hypothesis(suggested, _hypothesis_costs(photographs, patches, suggested, neighbours))
+    depth, cost = _best_hypothesis(suggested, patch_costs(photographs, patches, suggested, neighbours))
     # --- badly matched pixels: depths that no point suggests ---
     doubtful = np.flatnonzero(cost > MAX_AMBIGUOUS_COST)
     more = _trial_depths(depths[inside], len(doubtful), rng)
-    more_costs = _hypothesis_costs(photographs, patches[doubtful], more, neighbours)
+    more_costs = patch_costs(photographs, patches[doubtful], more, neighbours)
     other, other_cost = _best_hypothesis(more, more_costs)
     swept = np.zeros(len(depth), np.bool_)
     swept[doubtful] = other_cost < MAX_RIVALRY * np.minimum(cost[doubtful], MAX_COST)
@@ -235,25 +234,14 @@ def _lift_pixels(
     is_kept |= is_unmatched
     if background is not None:
         # --- pixels that match at infinity: the background ---
-        at_infinity = patch_cost(
-            photographs, patches, np.full(len(depth), BACKGROUND_DEPTH * depth.max()), neighbours
-        )
+        infinity = np.full((len(depth), 1), BACKGROUND_DEPTH * depth.max())
+        at_infinity = patch_costs(photographs, patches, infinity, neighbours)[:, 0]
         is_background = is_unmatched | (at_infinity < cost + BACKGROUND_COST_MARGIN)
         is_kept &= ~(is_background & background.is_above_horizon(patches.directions_world[:, 0]))
     distance = depth * patches.depth_factors[:, 0]
     xyz = patches.origin_world + distance[:, None] * patches.directions_world[:, 0]
     lifted = PlaneSweepPoints(xyz.astype(np.float32), patches.rgb_srgb[:, 0], swept)
     return lifted[is_kept], MatchEvidence(np.full(len(depth), index), distance, rivalry)[is_kept]
-
-
-def _hypothesis_costs(
-    photographs: ExposedPhotographs,
-    patches: PixelPatches,
-    guesses: Float64[np.ndarray, "n g"],
-    neighbours: list[int],
-) -> Float64[np.ndarray, "n g"]:
-    """Return how much each patch at each of its depths differs from what the neighbours show."""
-    return np.stack([patch_cost(photographs, patches, guess, neighbours) for guess in guesses.T], axis=1)
 
 
 def _best_hypothesis(

@@ -1,4 +1,4 @@
-"""The pixels' loss and its gradient in one pass."""
+"""The pixels' loss and its gradient in one pass, and the rays' errors."""
 
 from typing import NamedTuple
 
@@ -51,3 +51,18 @@ def pixel_terms(first: int, last: int, terms: PixelTerms, sums: Float64[np.ndarr
     count, chunks = len(terms.render), len(sums)
     for c in range(first, last):
         _part(c * count // chunks, (c + 1) * count // chunks, terms, sums[c])
+
+
+@kernel(error_model="numpy")
+def mean_errors(
+    render: Float32[np.ndarray, "r 3"],
+    target: Float32[np.ndarray, "r 3"],
+    weight: Float32[np.ndarray, " r"],
+    errors: Float32[np.ndarray, " r"],
+) -> None:
+    """Write each ray's mean absolute error over the channels, times its weight."""
+    for r in range(len(weight)):
+        total = np.float32(0.0)
+        for channel in range(3):
+            total += abs(render[r, channel] - target[r, channel]) * weight[r]
+        errors[r] = total / np.float32(3.0)

@@ -9,7 +9,7 @@ from scipy.ndimage import correlate1d
 from octasplat.engine.core.compilation import run_ranges
 from octasplat.engine.core.threads import threads_in_use
 from octasplat.engine.train.config import LossWeights
-from octasplat.engine.train.kernels.losses import CHUNKS, PixelTerms, pixel_terms
+from octasplat.engine.train.kernels.losses import CHUNKS, PixelTerms, mean_errors, pixel_terms
 from octasplat.engine.train.sampling.batches import Batch
 
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
@@ -97,7 +97,9 @@ def ray_errors(
     weight: Float32[np.ndarray, " r"],
 ) -> Float32[np.ndarray, " r"]:
     """Return each ray's mean absolute error, 0 without weight, for densification."""
-    return np.asarray((np.abs(render - target) * weight[:, None]).mean(axis=1, dtype=np.float32))
+    errors = np.empty(len(render), np.float32)
+    mean_errors(render, target, weight, errors)
+    return errors
 
 
 def _ssim_term(

@@ -58,6 +58,8 @@ class Batch:
     @cached_property
     def target_srgb(self) -> Float32[np.ndarray, "r 3"]:
         """Return the photographs' colors over the background."""
+        if self.alpha.min(initial=1) >= 1:  # most photographs are opaque
+            return self.rgb_srgb
         return composite_over(self.rgb_srgb, self.alpha, self.background_srgb)
 
 
