@@ -72,3 +72,11 @@ class GaussianSettings(Settings):
         description="Opacity that all Gaussians begin with. High ones suit surfaces, as with materials; low "
         "ones let the training choose among many.",
     )
+    opacity_decay: Annotated[float | None, Unit("factor"), EXPERIMENTAL] = Field(
+        None,
+        gt=0,
+        lt=1,
+        description="Share of all opacities that each rebuild of the hierarchy leaves until half of the "
+        "training, so that haze goes which photographs do not hold up; none leaves them alone. Try 0.99 "
+        "outdoors and where photographs are few.",
+    )

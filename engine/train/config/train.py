@@ -28,6 +28,7 @@ class TrainConfig(PhotographSettings, GaussianSettings, RaySettings):
     """
 
     former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.TRAIN
+    later_settings: ClassVar[frozenset[str]] = frozenset({"opacity_decay"})
 
     weight_averaging_start: Annotated[float, Unit("share of iterations"), ADVANCED] = Field(
         0.85,

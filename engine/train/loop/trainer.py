@@ -21,6 +21,7 @@ from octasplat.engine.trace.protocol import Tracer
 from octasplat.engine.train.config import TrainConfig, iteration_count, max_gaussian_count
 from octasplat.engine.train.densify import make_densifier
 from octasplat.engine.train.densify.normal_propagation import NormalPropagation
+from octasplat.engine.train.densify.opacity_decay import DECAY_UNTIL, decayed_logits
 from octasplat.engine.train.loop.allowed_region import AllowedRegion
 from octasplat.engine.train.loop.checkpoint import save_checkpoint
 from octasplat.engine.train.loop.iteration import LossGradients, TrainComponents, train_step
@@ -187,10 +188,13 @@ class Trainer:
                 state.average.clear()
             if schedule.is_rebuild_due(state.iteration, len(state.gaussians)):
                 state.raise_sh_degree(schedule.sh_degree(state.iteration))
+                is_resumed = 0 < state.iteration == first_iteration
+                if state.iteration > 0 and not is_resumed:  # else done before the checkpoint was written
+                    self._decay_opacities()
                 if self._min_scale is not None:
                     self._min_scale.apply(state.gaussians)
                 self._rebuild_bvh()
-                self._checkpoint_or_stop(watch, resumed=0 < state.iteration == first_iteration)
+                self._checkpoint_or_stop(watch, resumed=is_resumed)
                 schedule = self.schedule
             elif is_stale:
                 self._rebuild_bvh()
@@ -218,6 +222,12 @@ class Trainer:
             if self._on_step is not None and not is_stale:
                 with watch.paused():
                     self._on_step(state.iteration, components.tracer)
+
+    def _decay_opacities(self) -> None:
+        """Take a little of all opacities in the first part of the training, where that is asked for."""
+        factor, gaussians = self._config.opacity_decay, self.state.gaussians
+        if factor is not None and self.schedule.training_progress(self.state.iteration) <= DECAY_UNTIL:
+            gaussians.opacity_logits = decayed_logits(gaussians.opacity_logits, factor)
 
     def _finish(self) -> FlatGaussians:
         """Return the Gaussians to export, after measuring them on all views."""
