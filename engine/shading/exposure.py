@@ -100,6 +100,12 @@ class ExposureModel(WrapperModel):
         other._fixed_view = view
         return other
 
+    def over(self, inner: ShadingModel) -> "ExposureModel":
+        """Return the same exposures of another model's colors; they share the arrays."""
+        other = copy.copy(self)
+        other.inner = inner
+        return other
+
     def remove_exposure(
         self, rgb_srgb: Float32[np.ndarray, "h w 3"], view: int
     ) -> Float32[np.ndarray, "h w 3"]:

@@ -7,6 +7,8 @@ import pytest
 
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.runs.config import resolve_config
+from octasplat.engine.shading.exposure import ExposureModel
+from octasplat.engine.shading.plain import PLAIN_SHADING
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import TraceResult
 from octasplat.engine.train.config import LossWeights
@@ -44,7 +46,8 @@ def test_rays_that_pass_an_edge(
     assert passes_edge(traced(transmittance, depth, depth_median)).tolist() == [expected]
 
 
-def test_gradient_of_the_edge_term_is_its_slope() -> None:
+@pytest.mark.parametrize("exposed", [False, True])
+def test_gradient_of_the_edge_term_is_its_slope(exposed: bool) -> None:
     world = PlanarDataset()
     start = world.initial_gaussians(count=60, painted=True, opacity=0.99)
     start.means_world[start.means_world[:, 0] > 0, 2] -= 0.4  # one half before the other
@@ -54,6 +57,10 @@ def test_gradient_of_the_edge_term_is_its_slope() -> None:
     background = np.array([0.2, 0.4, 0.6], np.float32)
     batch = Batch(rays, target, alpha, weight, view, 0, 8, background)
     weights = LossWeights(l1=0.0, l2=1.0, edges=0.7)
+    exposures = ExposureModel(9, rate=0.01)
+    if exposed:
+        exposures.log_gains[:], exposures.offsets[:] = rng.normal(0, 0.2, (2, 9, 3))
+    gains, offsets = np.exp(exposures.log_gains)[view], exposures.offsets[view]
     tracer = make_tracer()
     tracer.build(start)
     chosen = passes_edge(tracer.trace(rays))
@@ -63,11 +70,13 @@ def test_gradient_of_the_edge_term_is_its_slope() -> None:
         moved = make_tracer()
         moved.build(replace(start, opacity_logits=opacity_logits.astype(np.float32)))
         result = moved.trace(rays)
-        render = result.rgb_srgb + result.transmittance[:, None] * background
+        shown = gains * result.rgb_srgb + offsets * result.alpha[:, None]
+        render = shown + result.transmittance[:, None] * background
         squared = (render.astype(np.float64) - batch.target_srgb) ** 2
         return 0.7 * float((squared.mean(axis=1) * chosen).sum() / 300)
 
-    found = tracer.backward(*edge_gradient(batch, tracer, weights)).numpy()
+    shading = exposures if exposed else PLAIN_SHADING
+    found = tracer.backward(*edge_gradient(batch, tracer, shading, weights, training_progress=0.5)).numpy()
     logits = start.opacity_logits.astype(np.float64)
     for row in np.argsort(-np.abs(found.opacity_logits))[:5]:
         step = np.zeros(60)

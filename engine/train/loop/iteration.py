@@ -97,7 +97,9 @@ def loss_and_gradients(
     if batch.visibility_rays is not None:
         recorded.append(free_space_gradient(batch.visibility_rays, tracer, weights.free_space))
     if batch.edge_batch is not None:
-        recorded.append(edge_gradient(batch.edge_batch, tracer, weights))
+        recorded.append(
+            edge_gradient(batch.edge_batch, tracer, shading, weights, training_progress=training_progress)
+        )
     # What several recordings say has to be added up first.
     min_trace_weight = min_blend_weight if len(recorded) == 1 else 0.0
     gradients = [
