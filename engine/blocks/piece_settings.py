@@ -185,6 +185,7 @@ def finish_settings(config: TrainConfig, iterations: int, of_blocks: Sequence[in
         update={
             "iterations": iterations,
             "densify_from_iter": iterations + 1,
+            "opacity_decay": None,
             "early_stopping_db": 0.0,
             "shared_sort_until": max(0.0, rest),
             "weight_averaging_start": averaging_start,
@@ -235,6 +236,7 @@ def polish_settings(config: TrainConfig, iterations: int, of_blocks: Sequence[in
         update={
             "iterations": iterations,
             "densify_from_iter": iterations + 1,
+            "opacity_decay": None,
             "early_stopping_db": 0.0,
             "lr": lr.model_copy(update={**rates, "scale_after": 0}),
         }

@@ -101,6 +101,8 @@ def test_finish_takes_the_last_steps_of_the_blocks_first(length: int) -> None:
 def test_finish_averages_states_unless_the_settings_forbid_it() -> None:
     default, last_state = TrainConfig(), TrainConfig(weight_averaging_start=1)
     assert finish_settings(default, 100).weight_averaging_start == 0.5
+    fading = default.model_copy(update={"opacity_decay": 0.99})  # which is for the first half alone
+    assert finish_settings(fading, 100).opacity_decay is polish_settings(fading, 100).opacity_decay is None
     for settings in (
         block_settings(last_state, 0.5, None, is_finished_later=True),
         polish_settings(last_state, 100),
