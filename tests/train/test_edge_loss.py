@@ -38,6 +38,7 @@ def traced(transmittance: float, depth: float, depth_median: float) -> TraceResu
         (0.0, 2.0, 2.0, False),  # one surface
         (0.0, 2.03, 2.0, True),  # one before another
         (0.5, 2.0, 2.0, True),  # one before nothing
+        (0.99, 2.0, 0.0, True),  # haze before nothing
     ],
 )
 def test_rays_that_pass_an_edge(
@@ -94,6 +95,14 @@ def test_further_rays_are_drawn_where_the_loss_has_the_term() -> None:
     assert (plain.rays.directions_world == both.rays.directions_world).all()
     assert len(both.edge_batch.rays) == 256
     assert (both.edge_batch.rays.directions_world != both.rays.directions_world).any()
+
+
+@pytest.mark.parametrize(
+    ("recipe", "expected"), [("split_sum", True), ("ref_gaussian", False), ("near_field", False)]
+)
+def test_rays_for_edges_ask_for_harmonics_that_learn_the_shaded_colors(recipe: str, expected: bool) -> None:
+    config = resolve_config("fast", materials=True, assignments=[f"materials.recipe={recipe}"]).train
+    assert BatchOptions.from_config(config, PlanarDataset()).has_edge_rays == expected
 
 
 def test_edges_without_materials_are_refused() -> None:

@@ -73,8 +73,8 @@ class LossWeights(Settings):
         None,
         ge=0,
         description="Weight of the difference from the photographs of as many further rays as a batch has, "
-        "which show harmonics, where they pass an edge; with materials alone. Thin parts and outlines come "
-        "out better, for about a fifth more time.",
+        "which show harmonics, where they pass an edge; with materials of the recipe split_sum alone. Thin "
+        "parts and outlines come out better, for about a fifth more time.",
     )
     depth_normal: Annotated[float, Unit("weight"), ADVANCED] = Field(
         0.0,

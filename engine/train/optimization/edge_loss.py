@@ -20,16 +20,18 @@ from octasplat.engine.train.shading_factory import find_exposures
 
 MIN_DEPTH_DIFFERENCE = 0.01
 """Between mean and median depth, of the latter, from which on a ray passes an edge."""
-CLEAR_TRANSMITTANCE = (0.02, 0.98)
-"""Between these a ray meets a thing in part."""
+MIN_TRANSMITTANCE = 0.02
+"""From which on a ray that meets a thing passes its edge, however faint what it meets is."""
 
 
 def passes_edge(result: TraceResult) -> Bool[np.ndarray, " r"]:
-    """Return which rays pass an edge: of a thing before nothing, or of one surface before another."""
+    """Return which rays pass an edge: of a thing before nothing, or of one surface before another.
+
+    Faint haze before nothing counts as well: the median depth is 0 where more than half is let through.
+    """
     difference = np.abs(result.expected_depth - result.depth_median)
-    least, most = CLEAR_TRANSMITTANCE
-    is_partly_met = (result.transmittance > least) & (result.transmittance < most)
-    return np.asarray(is_partly_met | (difference > MIN_DEPTH_DIFFERENCE * result.depth_median))
+    meets_in_part = (result.transmittance > MIN_TRANSMITTANCE) & (result.expected_depth > 0)
+    return np.asarray(meets_in_part | (difference > MIN_DEPTH_DIFFERENCE * result.depth_median))
 
 
 def edge_gradient(

@@ -12,6 +12,7 @@ from octasplat.engine.core.color import composite_over
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.shading.ray_patches import RayPatches
+from octasplat.engine.shading.recipes import material_shading
 from octasplat.engine.train.config import (
     VISIBILITY_RAY_MARGIN,
     Background,
@@ -78,7 +79,8 @@ class BatchOptions:
         visibility_ray_fraction: visibility rays beside each batch, of its rays; 0 where the loss has no term
             for them.
         reads_depths: whether the loss has a term for depth maps.
-        has_edge_rays: whether the loss has a term for edges.
+        has_edge_rays: whether the loss has a term for edges, which asks for harmonics that learn the shaded
+            colors; those of other recipes show the matt part alone, or nothing of mirrors.
     """
 
     rays_per_batch: int
@@ -110,7 +112,9 @@ class BatchOptions:
             ssim_patch_side_px=config.ssim_patch_side,
             visibility_ray_fraction=config.visibility_ray_fraction if config.loss.free_space > 0 else 0.0,
             reads_depths=bool(config.loss.depth),
-            has_edge_rays=bool(config.loss.edges) and config.materials.learn,
+            has_edge_rays=bool(config.loss.edges)
+            and config.materials.learn
+            and material_shading(config.materials.recipe).harmonics_are_shaded,
         )
 
 
