@@ -331,7 +331,7 @@ def channel_extras(widths: Mapping[str, int]) -> dict[str, object]:
 
 def declared_channel_attributes(document: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
     """Return the channels that a file's ``extras`` name, with their attributes in lower case without _."""
-    found = document.get("asset", {}).get("extras", {}).get(CHANNELS, {})
+    found = asset_extras(document).get(CHANNELS, {})
     widths = {name: int(width) for name, width in found.items() if width > 0}
     if sum(widths.values()) > MAX_CHANNEL_COLUMNS:
         raise ValueError(f"its channels have more than {MAX_CHANNEL_COLUMNS} columns")
@@ -358,10 +358,18 @@ def part_extras(part: int, count: int) -> dict[str, object]:
 
 def stated_part(document: Mapping[str, Any]) -> tuple[int, int] | None:
     """Return the place of a file among those of its scene, from 1, and their number; None if it is alone."""
-    match document.get("asset", {}).get("extras", {}).get(PART_KEY):
-        case [int(part), int(count)] if count > 1:
+    match asset_extras(document).get(PART_KEY):
+        case [int(part), int(count)] if 1 <= part <= count and count > 1:
             return part, count
     return None
+
+
+def asset_extras(document: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return what a file says of itself beyond the standard; nothing where that is of another kind."""
+    match document:
+        case {"asset": {"extras": Mapping() as extras}}:
+            return extras
+    return {}
 
 
 def part_note(document: Mapping[str, Any]) -> tuple[str, ...]:

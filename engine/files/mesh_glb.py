@@ -149,7 +149,7 @@ def _read_triangles(file: GlbFile, *, with_materials: bool) -> tuple[ImportedMes
                 extras[key].append(np.full((size, ATTRIBUTE_WIDTHS.get(key, 1)), np.nan, np.float32))
         count += size
     joined = {key: _concatenate_attribute(parts) for key, parts in extras.items()}
-    stated = file.document.get("asset", {}).get("extras", {})
+    stated = glb_container.asset_extras(file.document)
     numbers_stated = {
         key: float(value)
         for key in (Q_KEY, MIN_OPACITY_KEY, ALPHA_CUTOFF_KEY)

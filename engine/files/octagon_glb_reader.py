@@ -35,7 +35,7 @@ UNLIT = "KHR_materials_unlit"
 
 def octagon_q(file: GlbFile) -> float | None:
     """Return the chi-square quantile of a file's octagons; None where it has none, or has them lit."""
-    q = file.document.get("asset", {}).get("extras", {}).get(Q_KEY)
+    q = glb_container.asset_extras(file.document).get(Q_KEY)
     return float(q) if q is not None and UNLIT in file.document.get("extensionsUsed", []) else None
 
 
