@@ -30,8 +30,8 @@ def passes_edge(result: TraceResult) -> Bool[np.ndarray, " r"]:
     Faint haze before nothing counts as well: the median depth is 0 where more than half is let through.
     """
     difference = np.abs(result.expected_depth - result.depth_median)
-    meets_in_part = (result.transmittance > MIN_TRANSMITTANCE) & (result.expected_depth > 0)
-    return np.asarray(meets_in_part | (difference > MIN_DEPTH_DIFFERENCE * result.depth_median))
+    is_partly_met = (result.transmittance > MIN_TRANSMITTANCE) & (result.expected_depth > 0)
+    return np.asarray(is_partly_met | (difference > MIN_DEPTH_DIFFERENCE * result.depth_median))
 
 
 def edge_gradient(
