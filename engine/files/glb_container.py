@@ -46,9 +46,6 @@ MAX_CHUNKS = 64
 MAX_PRIMITIVES = 100_000
 MAX_CHANNEL_COLUMNS = 10_000
 CHANNELS = "octasplat_channels"
-PART_KEY = "octasplat_part"
-"""In the extras of a file that is one of several of a scene: its place among them, from 1, and their number.
-"""
 ALL_ROWS = slice(None)
 GLB_READ_ERRORS = (KeyError, IndexError, TypeError, ValueError, AttributeError)
 """What reading a document that says nonsense may raise."""
@@ -346,40 +343,12 @@ def json_bytes(document: dict[str, object]) -> bytes:
     return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
 
 
-def part_paths(path: Path, count: int) -> tuple[Path, ...]:
-    """Return the files of a scene for which one is too small: ``path``, ``<stem>.part2.glb`` and so on."""
-    return (path, *(path.with_name(f"{path.stem}.part{k}{path.suffix}") for k in range(2, count + 1)))
-
-
-def part_extras(part: int, count: int) -> dict[str, object]:
-    """Return what the ``extras`` of a file say of its place among so many, from 1; nothing if it is alone."""
-    return {PART_KEY: [part, count]} if count > 1 else {}
-
-
-def stated_part(document: Mapping[str, Any]) -> tuple[int, int] | None:
-    """Return the place of a file among those of its scene, from 1, and their number; None if it is alone."""
-    match asset_extras(document).get(PART_KEY):
-        case [int(part), int(count)] if 1 <= part <= count and count > 1:
-            return part, count
-    return None
-
-
 def asset_extras(document: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return what a file says of itself beyond the standard; nothing where that is of another kind."""
     match document:
         case {"asset": {"extras": Mapping() as extras}}:
             return extras
     return {}
-
-
-def part_note(document: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return what to tell of a file that holds only a part of its scene."""
-    stated = stated_part(document)
-    if stated is None:
-        return ()
-    return (
-        f"It is part {stated[0]} of the {stated[1]} files of a scene; octasplat merge puts them together.",
-    )
 
 
 def glb_size(json_room: int, length: int) -> int:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from octasplat.engine.core.color import round_to_bytes, srgb_to_linear
-from octasplat.engine.files import glb_container
+from octasplat.engine.files import glb_container, glb_parts
 from octasplat.engine.files.encodings import (
     HALF_TURN_SIGNS,
     half_turn_points,
@@ -121,7 +121,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     most = max(1, (glb_container.MAX_BYTES - glb_container.glb_size(room, 0)) // each)
     count = -(-len(scene) // most)
     ends = [number * len(scene) // count for number in range(count + 1)]
-    paths = glb_container.part_paths(path, count)
+    paths = glb_parts.part_paths(path, count)
     for number, (part_path, rows) in enumerate(zip(paths, itertools.pairwise(ends), strict=True), start=1):
         part = scene.view(slice(*rows))
         text = glb_container.json_bytes(_gltf_json(part, layout, options.facts, (number, count)))
@@ -164,7 +164,7 @@ def _gltf_json(
         "mode": glb_container.POINTS,
         "extensions": {EXTENSION: splats_json()},
     }
-    extras = glb_container.channel_extras(scene.channels.widths) | glb_container.part_extras(*part)
+    extras = glb_container.channel_extras(scene.channels.widths) | glb_parts.part_extras(*part)
     return {
         "asset": {"version": "2.0", "generator": "octasplat"} | ({"extras": extras} if extras else {}),
         "extensionsUsed": [EXTENSION],

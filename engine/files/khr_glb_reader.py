@@ -12,7 +12,7 @@ from jaxtyping import Float64
 
 from octasplat.engine.core.color import linear_to_srgb
 from octasplat.engine.core.errors import ConfigError, SceneFileError
-from octasplat.engine.files import glb_container
+from octasplat.engine.files import glb_container, glb_parts
 from octasplat.engine.files.channel_columns import ChannelChoice, select_channel_columns
 from octasplat.engine.files.encodings import (
     MAX_SH_DEGREE,
@@ -152,7 +152,7 @@ class _Splats:
         self._packed: SpzSource | None = None
         self._is_linear = splats.get("colorSpace") == "lin_rec709_display"
         self._notes = (
-            *glb_container.part_note(file.document),
+            *glb_parts.part_note(file.document),
             *dropped_sh_message(_sh_degree_of(attributes)),
         )
         if further:

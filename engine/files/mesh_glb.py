@@ -26,7 +26,7 @@ from jaxtyping import Float32, Int, Int32, Int64
 
 from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.core.errors import ConfigError, SceneFileError
-from octasplat.engine.files import glb_container
+from octasplat.engine.files import glb_container, glb_parts
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.glb_container import GlbFile, channel_attributes, pad_to_four, write_glb
 from octasplat.engine.files.glb_materials import glb_materials, texture_frame
@@ -166,7 +166,7 @@ def _read_triangles(file: GlbFile, *, with_materials: bool) -> tuple[ImportedMes
         min_opacity=numbers_stated.get(MIN_OPACITY_KEY),
         scene_size=scene_size_of(stated.get(SCENE_SIZE_KEY)),
         alpha_cutoff=numbers_stated.get(ALPHA_CUTOFF_KEY),
-        part=glb_container.stated_part(file.document),
+        part=glb_parts.stated_part(file.document),
         normals=joined.get("normal"),
         rgb_linear=joined.get("color"),
         alpha=_flatten_scalar(joined.get("alpha")),
@@ -215,7 +215,7 @@ def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions)
     soup = OctagonSoup(gaussians, path, options, OPAQUE_CUTOFF if options.opaque else None)
     png = white_with_alpha_png(options.falloff_texture_size, options.q)
     parts = _plan_files(soup, path, (len(png), len(ramp)), options)
-    paths = glb_container.part_paths(path, len(parts))
+    paths = glb_parts.part_paths(path, len(parts))
     for part_path, (layout, chunks) in zip(paths, parts, strict=True):
         bounds: list[Bounds] = []
         data = _octagon_data(
@@ -265,7 +265,7 @@ def _file_extras(soup: OctagonSoup, options: ExportOptions, parts: int) -> list[
     if options.opaque:
         extras[ALPHA_CUTOFF_KEY] = OPAQUE_CUTOFF
     extras |= glb_container.channel_extras(soup.channel_widths)
-    return [extras | glb_container.part_extras(part, parts) for part in range(1, parts + 1)]
+    return [extras | glb_parts.part_extras(part, parts) for part in range(1, parts + 1)]
 
 
 def _octagon_data(

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int
 
 from octasplat.engine.core.color import linear_to_srgb
-from octasplat.engine.files import glb_container
+from octasplat.engine.files import glb_container, glb_parts
 from octasplat.engine.files.channel_columns import ChannelChoice, select_channel_columns
 from octasplat.engine.files.encodings import sh0_from_rgb
 from octasplat.engine.files.glb_container import GlbFile
@@ -52,7 +52,7 @@ def read_octagons(file: GlbFile, path: Path, q: float, channels: ChannelChoice) 
         raise ValueError("its primitives differ in channels")
     count = sum(part.count for part in parts)
     stated = int(file.document["asset"]["extras"].get(SCENE_SIZE_KEY, 0))
-    part = glb_container.part_note(file.document)
+    part = glb_parts.part_note(file.document)
     # of a part of a scene, others have the rest
     notes = (*missing_gaussians_notes(0 if part else stated, count), *part)
     order = OctagonOrder(np.concatenate([part.ids() for part in parts]))

@@ -162,10 +162,13 @@ class BatchSource:
     def draw(self, rng: np.random.Generator, index: int = 0) -> Batch:
         """Draw the next batch, after ``index`` others."""
         batch = self._draw(rng, index)
-        if not self._options.has_edge_rays:
-            return batch
-        # counted backwards, so that they look elsewhere than the batch itself
-        return replace(batch, edge_batch=self._draw(rng, -1 - index))
+        if self._options.has_edge_rays:
+            # counted backwards, so that they look elsewhere than the batch itself
+            edge_batch = self._draw(rng, -1 - index)
+            _ = edge_batch.target_srgb
+            batch = replace(batch, edge_batch=edge_batch)
+        _ = batch.target_srgb  # worked out here, as the next batch is drawn beside the iteration
+        return batch
 
     def _draw(self, rng: np.random.Generator, index: int) -> Batch:
         options, sampler, side = self._options, self.sampler, self._options.ssim_patch_side_px
@@ -195,7 +198,7 @@ class BatchSource:
             visibility_rays = self._visibility_rays.draw(
                 rng, max(1, round(options.visibility_ray_fraction * options.rays_per_batch))
             )
-        batch = Batch(
+        return Batch(
             rays=rays,
             rgb_srgb=rgb,
             alpha=alpha,
@@ -208,8 +211,6 @@ class BatchSource:
             ray_patches=ray_patches,
             known_distances=distances,
         )
-        _ = batch.target_srgb  # worked out here, as the next batch is drawn beside the iteration
-        return batch
 
     def _patch_count(self) -> int:
         options, side = self._options, self._options.ssim_patch_side_px

@@ -1,0 +1,39 @@
+"""Scenes for which one GLB is too small: the names of their files, and what each says of its place."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from octasplat.engine.files.glb_container import asset_extras
+
+PART_KEY = "octasplat_part"
+"""In the extras of a file that is one of several of a scene: its place among them, from 1, and their number.
+"""
+
+
+def part_paths(path: Path, count: int) -> tuple[Path, ...]:
+    """Return the files of a scene for which one is too small: ``path``, ``<stem>.part2.glb`` and so on."""
+    return (path, *(path.with_name(f"{path.stem}.part{k}{path.suffix}") for k in range(2, count + 1)))
+
+
+def part_extras(part: int, count: int) -> dict[str, object]:
+    """Return what the ``extras`` of a file say of its place among so many, from 1; nothing if it is alone."""
+    return {PART_KEY: [part, count]} if count > 1 else {}
+
+
+def stated_part(document: Mapping[str, Any]) -> tuple[int, int] | None:
+    """Return the place of a file among those of its scene, from 1, and their number; None if it is alone."""
+    match asset_extras(document).get(PART_KEY):
+        case [int(part), int(count)] if 1 <= part <= count and count > 1:
+            return part, count
+    return None
+
+
+def part_note(document: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return what to tell of a file that holds only a part of its scene."""
+    stated = stated_part(document)
+    if stated is None:
+        return ()
+    return (
+        f"It is part {stated[0]} of the {stated[1]} files of a scene; octasplat merge puts them together.",
+    )
