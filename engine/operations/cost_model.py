@@ -14,7 +14,7 @@ from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.relight import RelightOptions
 from octasplat.engine.operations.render import RenderOptions
 from octasplat.engine.operations.render_options import PictureOptions
-from octasplat.engine.poses.config import DEFAULT_CONFIG, MAX_IMAGE_SIDE_PX
+from octasplat.engine.poses.config import DEFAULT_CONFIG, MAX_IMAGE_SIDE_PX, PROPOSALS_PER_PHOTOGRAPH
 from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.runs.result_files import SURFACE_GLB
 from octasplat.engine.train.config import TrainConfig, iteration_count, max_gaussian_count, uses_shared_sort
@@ -25,6 +25,12 @@ _MATCH_CPU_SECONDS_PER_PAIR = 0.1
 _PRESELECT_CPU_SECONDS_PER_PAIR = 0.002
 _MAP_CPU_SECONDS_PER_PHOTOGRAPH = 0.2
 """For finding poses, measured with 14 photographs of 960 x 638 pixels and 25 of 538 x 960."""
+_LARGE_FEATURES_CPU_SECONDS_PER_PIXEL = 5.0e-7
+_LARGE_MATCH_CPU_SECONDS_PER_PAIR = 0.06
+_LARGE_PAIRS_PER_PARTNER = 0.7
+_LARGE_MAP_CPU_SECONDS_PER_PHOTOGRAPH = 0.5
+_DECODE_CPU_SECONDS_PER_PIXEL = 1.2e-8
+"""The same in captures of more photographs than ``quick_look_up_to``, which are decoded twice."""
 _LOAD_CPU_SECONDS_PER_PIXEL = 1.0e-7
 _LIFT_CPU_SECONDS_PER_POINT = 7.0e-5
 _EVALUATE_CPU_SECONDS_PER_PIXEL = 2.7e-6
@@ -205,6 +211,17 @@ def _pose_search_cpu_seconds(photographs: Sequence[ImageSizes]) -> dict[str, flo
     count = sum(sizes.count for sizes in shrunk)
     pixels = sum(sizes.width_px * sizes.height_px * sizes.count for sizes in shrunk)
     every_pair = count * (count - 1) // 2
+    if DEFAULT_CONFIG.is_large(count):
+        decoded = 2 * sum(sizes.width_px * sizes.height_px * sizes.count for sizes in photographs)
+        pairs = min(every_pair, round(_LARGE_PAIRS_PER_PARTNER * count * DEFAULT_CONFIG.large_partners))
+        proposed = min(every_pair, count * PROPOSALS_PER_PHOTOGRAPH)
+        matching = _LARGE_MATCH_CPU_SECONDS_PER_PAIR * pairs
+        return {
+            "features": _LARGE_FEATURES_CPU_SECONDS_PER_PIXEL * pixels
+            + _DECODE_CPU_SECONDS_PER_PIXEL * decoded,
+            "matches": matching + _PRESELECT_CPU_SECONDS_PER_PAIR * proposed,
+            "poses": _LARGE_MAP_CPU_SECONDS_PER_PHOTOGRAPH * count,
+        }
     is_exhaustive = count <= DEFAULT_CONFIG.exhaustive_up_to
     pairs = every_pair if is_exhaustive else min(every_pair, count * DEFAULT_CONFIG.partners // 2)
     preselected = 0 if is_exhaustive else every_pair

@@ -24,6 +24,8 @@ MAX_FEATURES = 4096
 """Of a photograph; a second search takes twice as many, and fainter ones."""
 PRESELECTION_FEATURES = 511
 """Of a photograph, for the quick look that says which pairs are alike."""
+PROPOSALS_PER_PHOTOGRAPH = 100
+"""Most photographs that one proposes for the quick look in a large capture; others may propose it."""
 PRESELECTION_MATCHES = 12
 """By which two photographs are alike."""
 RETRY_BELOW_SHARE = 0.9
@@ -60,6 +62,11 @@ class PosesConfig(Settings):
         description="Most photographs that one is matched with for being alike. Raise it for scenes that "
         "look alike everywhere.",
     )
+    large_partners: Annotated[int, Unit("photographs"), ADVANCED] = Field(
+        20,
+        ge=2,
+        description="The same in a large capture, of more photographs than quick_look_up_to.",
+    )
     neighbours: Annotated[int, Unit("photographs"), ADVANCED] = Field(
         3,
         ge=0,
@@ -75,6 +82,10 @@ class PosesConfig(Settings):
         description="Photographs, evenly by name, that one whose pose is in doubt is matched with at first.",
     )
     seed: Annotated[int, ADVANCED] = Field(0, ge=0, description="Seed of everything random in the search.")
+
+    def is_large(self, photographs: int) -> bool:
+        """Return whether a capture of so many photographs is searched with less effort for each of them."""
+        return photographs > self.quick_look_up_to
 
 
 DEFAULT_CONFIG = PosesConfig()

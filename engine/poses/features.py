@@ -57,6 +57,11 @@ def create_database(
     """
     pycolmap.Database.open(database).close()  # COLMAP wants it to exist
     pycolmap.import_images(database, photographs, _camera_mode(one_camera), list(names))
+    return photographs_of(database)
+
+
+def photographs_of(database: Path) -> tuple[str, ...]:
+    """Return the photographs of a database in the order of their numbers."""
     with pycolmap.Database.open(database) as made:
         by_number = {image.image_id: image.name for image in made.read_all_images()}
     return tuple(by_number[number] for number in range(1, len(by_number) + 1))
@@ -96,6 +101,8 @@ def extract_features(
     options.sift.max_num_features = MAX_FEATURES * (2 if thorough else 1)
     if thorough:  # fainter features, too
         options.sift.peak_threshold /= 3
+    elif config.is_large(len(names)):
+        options.sift.first_octave = 0  # not in the enlarged photograph: 2.5 times as fast
     with pycolmap.Database.open(database) as found:
         missing = [
             image.name
@@ -191,10 +198,13 @@ def preselect_pairs(
     verification = pycolmap.TwoViewGeometryOptions()
     verification.min_num_inliers = _MIN_PRESELECTION_INLIERS
     count = len(names)
-    if count <= config.quick_look_up_to:
-        proposed = all_pairs(count)
+    if config.is_large(count):
+        proposed, partners = (
+            propose_pairs(database, small, count, seed=config.seed, threads=threads),
+            config.large_partners,
+        )
     else:
-        proposed = propose_pairs(database, small, count, seed=config.seed, threads=threads)
+        proposed, partners = all_pairs(count), config.partners
     alike: dict[Pair, int] = {}
     looked = unlike = pair_count(count) - len(proposed)
     on_count(unlike)
@@ -214,7 +224,7 @@ def preselect_pairs(
         alike,
         count,
         min_matches=PRESELECTION_MATCHES,
-        partners=config.partners,
+        partners=partners,
         neighbours=config.neighbours,
     )
 

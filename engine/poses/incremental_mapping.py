@@ -15,6 +15,14 @@ from octasplat.engine.core.scene_layout import MIN_PHOTOGRAPHS
 
 OnCount = Callable[[int], None]
 
+_LARGE_GROWTH = 1.4
+"""Of a large capture all is adjusted after it has grown by so much, instead of 1.1."""
+_LARGE_REFINEMENTS = 2
+"""Adjustments in a row at most, instead of 5."""
+_LARGE_ADJUSTMENT_STEPS = 20
+"""Iterations of each, instead of 50."""
+_LARGE_TOLERANCE = 1e-5
+"""Relative fall of the cost at which one ends."""
 _WEAK_INLIERS = 15
 """Matches by which a photograph can be placed where the usual 30 leave some out."""
 _WEAK_INITIAL_INLIERS = 50
@@ -27,6 +35,7 @@ def map_photographs(
     *,
     seed: int,
     on_count: OnCount,
+    is_large: bool = False,
     allow_weak_links: bool = False,
     start: Path | None = None,
 ) -> Any:
@@ -37,6 +46,7 @@ def map_photographs(
         photographs: folder.
         seed: of everything random.
         on_count: hears of photographs of the largest model so far.
+        is_large: adjust all photographs less often and with fewer steps.
         allow_weak_links: place photographs by fewer matches, too.
         start: folder of a model to go on from.
 
@@ -51,6 +61,11 @@ def map_photographs(
     options.ba_use_gpu = False
     options.min_model_size = MIN_PHOTOGRAPHS
     options.extract_colors = False  # extracted once, for the model that is kept
+    if is_large:
+        options.ba_global_frames_ratio = options.ba_global_points_ratio = _LARGE_GROWTH
+        options.ba_global_max_refinements = _LARGE_REFINEMENTS
+        options.ba_global_max_num_iterations = _LARGE_ADJUSTMENT_STEPS
+        options.ba_global_function_tolerance = options.ba_local_function_tolerance = _LARGE_TOLERANCE
     if allow_weak_links:
         options.mapper.abs_pose_min_num_inliers = _WEAK_INLIERS
         options.mapper.init_min_num_inliers = _WEAK_INITIAL_INLIERS

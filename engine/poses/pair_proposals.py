@@ -12,10 +12,9 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float32
 
+from octasplat.engine.poses.config import PROPOSALS_PER_PHOTOGRAPH
 from octasplat.engine.poses.pairs import Pair, neighbor_pairs
 
-PROPOSALS_PER_PHOTOGRAPH = 100
-"""Most photographs that one proposes; others may propose it."""
 NEIGHBORS_BY_NAME = 10
 MIN_GPS_SHARE = 0.9
 """Share of the photographs that must have GPS for it to propose alone."""

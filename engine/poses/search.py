@@ -21,6 +21,7 @@ from octasplat.engine.poses.config import (
     MATCHES,
     MAX_REPROJECTION_PX,
     MIN_POINTS,
+    PROPOSALS_PER_PHOTOGRAPH,
     RECORD_FILE,
     RETRY_BELOW_SHARE,
     PosesConfig,
@@ -30,13 +31,15 @@ from octasplat.engine.poses.features import (
     extract_features,
     feature_counts,
     match_pairs,
+    photographs_of,
     preselect_pairs,
 )
 from octasplat.engine.poses.incremental_mapping import map_photographs, model_rank
-from octasplat.engine.poses.pair_proposals import PROPOSALS_PER_PHOTOGRAPH
 from octasplat.engine.poses.pairs import Pair, all_pairs, pair_count, pairs_with
 from octasplat.engine.poses.workspace import link_photographs, progress_stage
 
+DATABASE = "database.db"
+"""Of the first search, in the folder for the work."""
 MIN_RECOMMENDED_SIDE_PX = 480
 """Below this, what COLMAP finds was seen to be wrong without any sign of it."""
 _FEW_FEATURES = 50
@@ -121,7 +124,7 @@ class PoseSearch:
         )
 
     def _search(self, *, thorough: bool) -> Any:
-        database = self._work / ("thorough.db" if thorough else "database.db")
+        database = self._work / ("thorough.db" if thorough else DATABASE)
         self._find_features(database, thorough)
         matched = self._match(database, thorough)
         count = len(self._names)
@@ -130,7 +133,7 @@ class PoseSearch:
         with progress_stage(MAPPING_STAGE, count, self._progress) as at:
             best = self._disambiguate(
                 database,
-                map_photographs(database, self._photographs, seed=self._config.seed, on_count=at),
+                self._map(database, at),
                 at,
             )
             if model_rank(best)[0] < count:
@@ -141,7 +144,6 @@ class PoseSearch:
     def _find_features(self, database: Path, thorough: bool) -> None:
         with progress_stage(FEATURES, len(self._names), self._progress) as at:
             if not database.exists():
-                # made under another name, so that a database that is there is whole
                 new = database.with_suffix(".new")
                 new.unlink(missing_ok=True)
                 create_database(new, self._photographs, self._aliases, one_camera=self._one_camera)
@@ -198,7 +200,7 @@ class PoseSearch:
             trial = database.with_name("trial.db")
             shutil.copyfile(database, trial)
             remove_pairs(trial, false)
-            again = map_photographs(trial, self._photographs, seed=self._config.seed, on_count=at)
+            again = self._map(trial, at)
             if model_rank(again)[0] < model_rank(model)[0]:
                 break
             # fewer matches explained: the cut was no fold
@@ -218,7 +220,7 @@ class PoseSearch:
         posed = set() if best is None else {number - 1 for number in best.reg_image_ids()}
         count = len(self._names)
         rest = [k for k in range(count) if k not in posed]
-        is_large = count > self._config.quick_look_up_to
+        is_large = self._config.is_large(count)
         more = pairs_with(rest, count, matched, within=PROPOSALS_PER_PHOTOGRAPH if is_large else None)
         if more:
             match_pairs(
@@ -235,15 +237,26 @@ class PoseSearch:
             start = self._work / "start"
             start.mkdir(exist_ok=True)
             best.write_binary(start)
-        again = map_photographs(
+        again = self._map(database, at, allow_weak_links=True, start=start)
+        return max(best, again, key=model_rank)
+
+    def _map(
+        self,
+        database: Path,
+        at: Callable[[int], None],
+        *,
+        allow_weak_links: bool = False,
+        start: Path | None = None,
+    ) -> Any:
+        return map_photographs(
             database,
             self._photographs,
             seed=self._config.seed,
             on_count=at,
-            allow_weak_links=True,
+            is_large=self._config.is_large(len(self._names)),
+            allow_weak_links=allow_weak_links,
             start=start,
         )
-        return max(best, again, key=model_rank)
 
     def _drop_unreadable(self) -> None:
         """Leave out photographs that COLMAP does not read, and warn of all that nobody could read.
@@ -254,10 +267,17 @@ class PoseSearch:
         Raises:
             DatasetError: too few are left.
         """
-        trial = self._work / "readable.db"
-        trial.unlink(missing_ok=True)
-        read = set(create_database(trial, self._photographs, self._aliases, one_camera=False))
-        trial.unlink()
+        database = self._work / DATABASE
+        if database.exists():  # of a search that was stopped
+            read = set(photographs_of(database))
+        else:
+            # made under another name, so that a database that is there is whole
+            trial = database.with_suffix(".new")
+            trial.unlink(missing_ok=True)
+            one_camera = self._has_one_size()
+            read = set(create_database(trial, self._photographs, self._aliases, one_camera=one_camera))
+            if len(read) == len(self._aliases):
+                trial.rename(database)  # COLMAP decodes every photograph for it: do so once
         kept = [k for k, alias in enumerate(self._aliases) if alias in read]
         self._names = tuple(self._names[k] for k in kept)
         self._aliases = tuple(self._aliases[k] for k in kept)

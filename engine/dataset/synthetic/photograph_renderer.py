@@ -65,13 +65,18 @@ class PhotographRenderer:
         away = np.sum(normals * directions, axis=1) > 0
         normals[away] *= -1
         return RenderedPhotograph(
-            to_bytes(self._render_pixels(view)).reshape(height, width, -1),
+            self.render_pixels(view),
             depth.reshape(height, width),
             normals.reshape(height, width, 3),
             (hit & life.face_is_foreground[hits.faces]).reshape(height, width),
         )
 
-    def _render_pixels(self, view: SyntheticView) -> Float32[np.ndarray, "n channels"]:
+    def render_pixels(self, view: SyntheticView) -> UInt8[np.ndarray, "height width channels"]:
+        """Render the photograph of ``view`` alone."""
+        config = self._config
+        return to_bytes(self._display_colors(view)).reshape(config.height_px, config.width_px, -1)
+
+    def _display_colors(self, view: SyntheticView) -> Float32[np.ndarray, "n channels"]:
         """Return box-filtered display colors of all pixels."""
         samples = len(self._offsets)
         step = max(1, _RAYS_PER_CHUNK // samples) * samples

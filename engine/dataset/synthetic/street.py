@@ -33,6 +33,7 @@ from octasplat.engine.dataset.synthetic.shapes import (
 )
 from octasplat.engine.dataset.synthetic.still_life import vase_mesh
 from octasplat.engine.dataset.synthetic.street_albedo import (
+    DISTINCT_FROM,
     SIDE_STEP,
     STOREY,
     WINDOW_STEP,
@@ -47,6 +48,8 @@ LOT = 14.0
 FACADE_Y = 9.0
 _WIDTH, _DEPTH = 5 * WINDOW_STEP, 4 * WINDOW_STEP
 _CELL = 0.35
+_ALIKE_UP_TO = 8
+"""Longer streets have houses that are all different."""
 # So far away that its radius is seen as half a degree, twice the sun's, at the height of the afternoon's sun.
 _SUN_DISTANCE = 400.0
 _SUN_WORLD = _SUN_DISTANCE * np.array([0.42, -0.5, 0.76]) / np.linalg.norm([0.42, -0.5, 0.76])
@@ -102,10 +105,14 @@ def half_length(houses: int) -> float:
 
 
 def _houses(side: float, houses: int) -> list[SceneObject]:
-    """Return the houses of the side of ``side`` times y."""
+    """Return the houses of the side of ``side`` times y.
+
+    In a long street no two are alike, since a search for poses takes houses that are alike for one.
+    """
     made = []
+    first = (houses if side < 0 else 0) + (DISTINCT_FROM if houses > _ALIKE_UP_TO else 0)
     for k in range(houses):
-        number = k + (houses if side < 0 else 0)
+        number = first + k
         storeys, rise = 2 + (5 * number // 3) % 2, 2.2 + 0.4 * (number % 4)
         walls, roof = _house_meshes(storeys, rise)
         turn = rotation_z(0.0 if side > 0 else 180.0)

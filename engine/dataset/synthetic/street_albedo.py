@@ -24,6 +24,8 @@ WINDOW_STEP, STOREY = 2.2, 3.0
 """Metres from window to window, along and up."""
 _PLASTERS = ("d9c3a0", "b7c4c9", "c98d6b", "e3ddcf", "9fae8c", "d8b46a", "a9929f", "c7b7a3")
 _FRAMES = ("f4f1ea", "3c4a3e", "5b3a29", "dfe6ea")
+DISTINCT_FROM = 16
+"""From this number on no two houses are alike: each has its own tint and sign."""
 _SIGNS = ("OCTAGON", "SPLAT", "GALLERIA", "PASTA", "CEREAL", "REGAL", "ORIGINAL", "LOGIC")
 
 
@@ -34,6 +36,11 @@ def facade(number: int, storeys: int) -> Callable[[TexturePoints, UvCoordinates]
     """
     body, frame = linear_from_hex(_PLASTERS[number % 8]), linear_from_hex(_FRAMES[number % 4])
     is_brick = number % 3 == 1
+    word = _SIGNS[number % len(_SIGNS)]
+    if number >= DISTINCT_FROM:
+        other = linear_from_hex(_PLASTERS[(number // 8 + number) % 8])
+        body = body + np.float32(0.12 * (number % 7)) * (other - body)
+        word = f"{word[:3]} {_SIGNS[number // 8 % len(_SIGNS)][:4]}"
 
     def material(xyz: TexturePoints, uv: UvCoordinates) -> Colors:
         side = np.floor(uv[:, 0] / SIDE_STEP)
@@ -52,7 +59,6 @@ def facade(number: int, storeys: int) -> Callable[[TexturePoints, UvCoordinates]
         wood = lerp(linear_from_hex(("7a2e25", "274156", "3f5a36")[number % 3]), frame, 0.8 * panel)
         colors = lerp(colors, wood * grey_column(0.9 + 0.3 * grain), door)
         board = box_mask(u, 3.4, 7.8) * box_mask(v, 2.5, 2.95) * is_front
-        word = _SIGNS[number % len(_SIGNS)]
         start = 5.6 - 0.25 * len(word)
         ink = text_mask((u - start) / 0.5, (v - 2.9) / 0.5, [word]) * box_mask(
             u, start, start + 0.5 * len(word)
