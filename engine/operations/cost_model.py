@@ -29,8 +29,11 @@ _LARGE_FEATURES_CPU_SECONDS_PER_PIXEL = 5.0e-7
 _LARGE_MATCH_CPU_SECONDS_PER_PAIR = 0.06
 _LARGE_PAIRS_PER_PARTNER = 0.7
 _LARGE_MAP_CPU_SECONDS_PER_PHOTOGRAPH = 0.5
+"""The same in captures of more photographs than ``quick_look_up_to``."""
+_READ_CPU_SECONDS_PER_PIXEL = 1.8e-8
+"""To read photographs to their ends, and once more by COLMAP."""
 _DECODE_CPU_SECONDS_PER_PIXEL = 1.2e-8
-"""The same in captures of more photographs than ``quick_look_up_to``, which are decoded twice."""
+"""By COLMAP."""
 _LOAD_CPU_SECONDS_PER_PIXEL = 1.0e-7
 _LIFT_CPU_SECONDS_PER_POINT = 7.0e-5
 _EVALUATE_CPU_SECONDS_PER_PIXEL = 2.7e-6
@@ -210,15 +213,17 @@ def _pose_search_cpu_seconds(photographs: Sequence[ImageSizes]) -> dict[str, flo
     shrunk = [capped_sizes(sizes, MAX_IMAGE_SIDE_PX) for sizes in photographs]
     count = sum(sizes.count for sizes in shrunk)
     pixels = sum(sizes.width_px * sizes.height_px * sizes.count for sizes in shrunk)
+    full_pixels = sum(sizes.width_px * sizes.height_px * sizes.count for sizes in photographs)
+    reading = _READ_CPU_SECONDS_PER_PIXEL * full_pixels
     every_pair = count * (count - 1) // 2
     if DEFAULT_CONFIG.is_large(count):
-        decoded = 2 * sum(sizes.width_px * sizes.height_px * sizes.count for sizes in photographs)
         pairs = min(every_pair, round(_LARGE_PAIRS_PER_PARTNER * count * DEFAULT_CONFIG.large_partners))
         proposed = min(every_pair, count * PROPOSALS_PER_PHOTOGRAPH)
         matching = _LARGE_MATCH_CPU_SECONDS_PER_PAIR * pairs
         return {
+            "read": reading,
             "features": _LARGE_FEATURES_CPU_SECONDS_PER_PIXEL * pixels
-            + _DECODE_CPU_SECONDS_PER_PIXEL * decoded,
+            + _DECODE_CPU_SECONDS_PER_PIXEL * full_pixels,
             "matches": matching + _PRESELECT_CPU_SECONDS_PER_PAIR * proposed,
             "poses": _LARGE_MAP_CPU_SECONDS_PER_PHOTOGRAPH * count,
         }
@@ -226,6 +231,7 @@ def _pose_search_cpu_seconds(photographs: Sequence[ImageSizes]) -> dict[str, flo
     pairs = every_pair if is_exhaustive else min(every_pair, count * DEFAULT_CONFIG.partners // 2)
     preselected = 0 if is_exhaustive else every_pair
     return {
+        "read": reading,
         "features": _FEATURES_CPU_SECONDS_PER_PIXEL * pixels,
         "matches": _MATCH_CPU_SECONDS_PER_PAIR * pairs + _PRESELECT_CPU_SECONDS_PER_PAIR * preselected,
         "poses": _MAP_CPU_SECONDS_PER_PHOTOGRAPH * count,

@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from octasplat.engine.settings.base import Settings
 from octasplat.engine.settings.fields import ADVANCED, Unit
 
-FEATURES, MATCHES, MAPPING_STAGE = "features", "matches", "poses"
+READING, FEATURES, MATCHES, MAPPING_STAGE = "read", "features", "matches", "poses"
 """The stages of the search."""
 PLACING_STAGE = "placing"
 """The last stage where poses are given, and only those in doubt are asked."""

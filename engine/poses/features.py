@@ -33,6 +33,7 @@ OnCount = Callable[[int], None]
 """Told how many are done."""
 
 _PHOTOGRAPHS_PER_BATCH = 4
+_PHOTOGRAPHS_PER_IMPORT = 16
 _PAIRS_PER_BATCH = 64
 _PRESELECTION_PAIRS_PER_BATCH = 2048
 _MIN_PRESELECTION_INLIERS = 4
@@ -41,7 +42,12 @@ _RELAXED_MATCH_RATIO = 0.9
 
 
 def create_database(
-    database: Path, photographs: Path, names: Sequence[str], *, one_camera: bool
+    database: Path,
+    photographs: Path,
+    names: Sequence[str],
+    *,
+    one_camera: bool,
+    on_count: OnCount = lambda _done: None,
 ) -> tuple[str, ...]:
     """Make a database of photographs, without features.
 
@@ -50,13 +56,23 @@ def create_database(
         photographs: folder.
         names: of the photographs in it.
         one_camera: all photographs were taken with one lens.
+        on_count: hears of photographs, each of which COLMAP decodes.
 
     Returns:
         The photographs as the database numbers them, from 1 on. COLMAP leaves out files that it cannot read
         and gives their numbers to those that follow.
     """
     pycolmap.Database.open(database).close()  # COLMAP wants it to exist
-    pycolmap.import_images(database, photographs, _camera_mode(one_camera), list(names))
+    # with one camera for all, it makes no difference in how many calls
+    step = _PHOTOGRAPHS_PER_IMPORT if one_camera else max(1, len(names))
+    options = pycolmap.ImageReaderOptions()
+    for start in range(0, len(names), step):
+        some = list(names[start : start + step])
+        pycolmap.import_images(database, photographs, _camera_mode(one_camera), some, options)
+        if one_camera:
+            with pycolmap.Database.open(database) as made:
+                options.existing_camera_id = 1 if made.num_cameras() else -1
+        on_count(start + len(some))
     return photographs_of(database)
 
 

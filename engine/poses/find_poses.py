@@ -54,9 +54,10 @@ def find_poses(
 ) -> None:
     """Find where photographs were taken, and a sparse point cloud.
 
-    There are three stages: ``features``, whose steps are photographs, ``matches``, whose steps are pairs of
-    them, and ``poses``, whose steps are photographs again, the last one the number of those placed. Where
-    photographs are left out, the three may come a second time. The same photographs give the same files on
+    There are four stages: ``read`` and ``features``, whose steps are photographs, ``matches``, whose steps
+    are pairs of them, and ``poses``, whose steps are photographs again, the last one the number of those
+    placed. Where photographs are left out, the last three may come a second time; a search that goes on has
+    no ``read``. The same photographs give the same files on
     any number of threads. A result that is there already is taken as it is. A search that was stopped goes
     on with the features and matches that it had found.
 

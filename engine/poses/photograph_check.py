@@ -1,7 +1,7 @@
 """Photographs are read to their ends before poses are searched, which takes far longer."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -12,10 +12,22 @@ DECODING_BYTES = 2 << 30
 """Memory that decoding threads may take together; one thread always runs."""
 
 
-def check_photographs_decode(folder: Path, names: Sequence[str], *, threads: int = 0) -> None:
+def check_photographs_decode(
+    folder: Path,
+    names: Sequence[str],
+    *,
+    threads: int = 0,
+    on_count: Callable[[int], None] = lambda _done: None,
+) -> None:
     """Refuse photographs whose files begin well and end early: COLMAP takes them, the training cannot.
 
     Files that are no images from their beginning are left out by COLMAP, and told.
+
+    Args:
+        folder: of the photographs.
+        names: of them in it.
+        threads: to use; 0 means all cores.
+        on_count: hears of photographs.
 
     Raises:
         DatasetError: a file is damaged or cut short.
@@ -38,7 +50,8 @@ def check_photographs_decode(folder: Path, names: Sequence[str], *, threads: int
     with ThreadPoolExecutor(workers) as pool:
         futures = [pool.submit(read, file) for file in sizes]
         try:
-            for future in futures:
+            for done, future in enumerate(futures, start=1):
                 future.result()
+                on_count(done)
         finally:
             pool.shutdown(cancel_futures=True)

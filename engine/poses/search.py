@@ -22,6 +22,7 @@ from octasplat.engine.poses.config import (
     MAX_REPROJECTION_PX,
     MIN_POINTS,
     PROPOSALS_PER_PHOTOGRAPH,
+    READING,
     RECORD_FILE,
     RETRY_BELOW_SHARE,
     PosesConfig,
@@ -36,6 +37,7 @@ from octasplat.engine.poses.features import (
 )
 from octasplat.engine.poses.incremental_mapping import map_photographs, model_rank
 from octasplat.engine.poses.pairs import Pair, all_pairs, pair_count, pairs_with
+from octasplat.engine.poses.photograph_check import check_photographs_decode
 from octasplat.engine.poses.workspace import link_photographs, progress_stage
 
 DATABASE = "database.db"
@@ -274,8 +276,7 @@ class PoseSearch:
             # made under another name, so that a database that is there is whole
             trial = database.with_suffix(".new")
             trial.unlink(missing_ok=True)
-            one_camera = self._has_one_size()
-            read = set(create_database(trial, self._photographs, self._aliases, one_camera=one_camera))
+            read = self._read_photographs(trial)
             if len(read) == len(self._aliases):
                 trial.rename(database)  # COLMAP decodes every photograph for it: do so once
         kept = [k for k, alias in enumerate(self._aliases) if alias in read]
@@ -293,6 +294,27 @@ class PoseSearch:
             raise DatasetError(
                 f"Only {len(self._names)} of {len(self._all_names)} photographs can be read; at least "
                 f"{MIN_PHOTOGRAPHS} are needed."
+            )
+
+    def _read_photographs(self, database: Path) -> set[str]:
+        """Read each photograph to its end, and once more by COLMAP; returns those that COLMAP can read.
+
+        Raises:
+            DatasetError: a photograph is cut short.
+        """
+        count = len(self._aliases)
+        with progress_stage(READING, count, self._progress) as at:
+            check_photographs_decode(
+                self._images, self._names, threads=max(self._threads, 0), on_count=lambda done: at(done // 2)
+            )
+            return set(
+                create_database(
+                    database,
+                    self._photographs,
+                    self._aliases,
+                    one_camera=self._has_one_size(),
+                    on_count=lambda done: at(count // 2 + done - done // 2),
+                )
             )
 
     def _has_one_size(self) -> bool:

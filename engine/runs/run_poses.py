@@ -20,7 +20,6 @@ from octasplat.engine.poses.find_poses import (
     repair_poses,
 )
 from octasplat.engine.poses.lens_check import needs_per_view_principal_points
-from octasplat.engine.poses.photograph_check import check_photographs_decode
 from octasplat.engine.poses.photographs import photographs_of_scene
 from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.runs.run_folder import POSES, found_model_folder
@@ -52,7 +51,7 @@ def find_missing_poses(
         return
     names = photographs_of_scene(scene)
     if not (output / POSES).is_dir():  # a search that has begun was let through before
-        _refuse_before_search(scene, names, config, threads)
+        _refuse_before_search(scene, names, config)
     find_poses(
         image_folder(scene),
         output / POSES,
@@ -63,9 +62,7 @@ def find_missing_poses(
     )
 
 
-def _refuse_before_search(
-    scene: Path, names: Sequence[str], config: ReconstructionConfig, threads: int
-) -> None:
+def _refuse_before_search(scene: Path, names: Sequence[str], config: ReconstructionConfig) -> None:
     """Refuse photographs and settings that the dataset would refuse after the search, which takes long."""
     split_views(
         names,
@@ -79,7 +76,6 @@ def _refuse_before_search(
             f"Masks are to be the alpha, but there is no folder {scene / 'masks'}; put them there (as "
             f"{names[0]}.png) or leave --masks alpha out."
         )
-    check_photographs_decode(image_folder(scene), names, threads=threads)
 
 
 def repair_run_poses(

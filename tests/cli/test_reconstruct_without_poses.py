@@ -55,7 +55,7 @@ def test_poses_are_found_in_the_run_and_the_same_on_any_threads(photographs, oct
         assert (runs[0] / name).read_bytes() == (runs[1] / name).read_bytes(), name
     events = [json.loads(line) for line in (runs[0] / "events.jsonl").read_text().splitlines()]
     finished = [event["stage"] for event in events if event["kind"] == "stage_finished"]
-    assert finished[:3] == ["features", "matches", "poses"] and finished[-4] == "load"
+    assert finished[:4] == ["read", "features", "matches", "poses"] and finished[-4] == "load"
     again = octasplat("reconstruct", photographs, "-o", runs[0], "--resume")
     assert again.exit_code == 0 and "features" not in again.stdout
     views = octasplat("render", runs[0], "-o", tmp_path / "views", "--views", "held-out")

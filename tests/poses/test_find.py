@@ -103,7 +103,7 @@ def test_poses_are_those_of_the_cameras(taken: Photographs, found_at_once: Found
     errors = np.linalg.norm(aligned(a, b) - b, axis=1)
     # Of so few pixels; the focal length is found with them, which processors round differently.
     assert np.median(errors) < 0.03 * np.linalg.norm(b - b.mean(0), axis=1).mean()
-    wanted = [("features", COUNT), ("matches", COUNT * (COUNT - 1) // 2), ("poses", COUNT)]
+    wanted = [("read", COUNT), ("features", COUNT), ("matches", COUNT * (COUNT - 1) // 2), ("poses", COUNT)]
     begun = [event for event in events if isinstance(event, PhaseStarted)]
     assert [(event.stage, event.total_steps) for event in begun] == wanted
     assert [event.stage for event in events if isinstance(event, PhaseFinished)] == [

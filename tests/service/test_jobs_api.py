@@ -101,12 +101,12 @@ async def test_dataset_must_be_committed_and_have_poses(connect_service: Connect
         found = {"dataset_id": without, "options": {"poses": "auto"}}
         answer = await http.post("/v1/jobs", json=found)
         assert answer.status_code == 202
-        assert answer.json()["stages"][:4] == ["features", "matches", "poses", "load"]
+        assert answer.json()["stages"][:4] == ["read", "features", "matches", "poses"]
 
 
 async def test_poses_are_found_only_where_they_are_missing(connect_service: ConnectService) -> None:
     async with connect_service() as (http, service):
-        for has_poses, kept, first in ((True, "given", "load"), (False, "auto", "features")):
+        for has_poses, kept, first in ((True, "given", "load"), (False, "auto", "read")):
             dataset = await committed_dataset(service, has_poses=has_poses)
             asked = {"dataset_id": dataset, "options": {}}
             job = (await http.post("/v1/jobs", json=asked)).json()

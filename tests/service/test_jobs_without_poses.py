@@ -70,7 +70,9 @@ def test_reconstruct_folder_without_poses_succeeds(
     with Api(machine.address, machine.token) as api:
         (listed,) = api.get("/v1/jobs")["jobs"]
         job = api.get(f"/v1/jobs/{listed['id']}")
-        assert job["stages"] == ["features", "matches", "poses", "load", "train", "evaluate", "export"]
+        assert job["stages"] == [
+            "read", "features", "matches", "poses", "load", "train", "evaluate", "export",
+        ]  # fmt: skip
         assert job["options"]["poses"] == "auto" and job["state"] == "succeeded"
         events = api.get(f"/v1/jobs/{job['id']}/timeline", limit=5000)["events"]
         told = {e["data"]["stage"] for e in events if e["kind"] == "progress" and "total_steps" in e["data"]}

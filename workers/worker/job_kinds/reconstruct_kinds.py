@@ -107,7 +107,7 @@ class ReconstructKind(OperationKind):
         """Return the stages, those that find poses among them if there are none, nor any of a source job."""
         stages = ("load", "train", "evaluate", "export")
         is_posed = options.poses == "given" or options.begins_with_source
-        return stages if is_posed else ("features", "matches", "poses", *stages)
+        return stages if is_posed else ("read", "features", "matches", "poses", *stages)
 
     def starts_from_result(self, options: ReconstructJobConfig) -> bool:
         """Return whether the training begins with the Gaussians of the source job."""
