@@ -182,7 +182,7 @@ def preselect_pairs(
     """
     small = database.with_name("quick.db")
     small.unlink(missing_ok=True)
-    _copy_largest_features(database, small, len(names), PRESELECTION_FEATURES)
+    copy_largest_features(database, small, len(names), PRESELECTION_FEATURES)
     options = pycolmap.FeatureMatchingOptions()
     options.num_threads = threads
     options.use_gpu = False
@@ -239,7 +239,8 @@ def _match_pairs(
     )
 
 
-def _copy_largest_features(database: Path, small: Path, photographs: int, count: int) -> None:
+def copy_largest_features(database: Path, small: Path, photographs: int, count: int) -> None:
+    """Make a database of so many photographs with the ``count`` largest features of each."""
     with pycolmap.Database.open(database) as source, pycolmap.Database.open(small) as target:
         for camera in source.read_all_cameras():
             target.write_camera(camera, use_camera_id=True)

@@ -5,7 +5,7 @@ now and then other photographs; most of the mapper runs on one thread anyway.
 """
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +29,10 @@ def map_photographs(
     on_count: OnCount,
     allow_weak_links: bool = False,
     start: Path | None = None,
-) -> Any:
-    """Reconstruct the photographs incrementally and return the model with the most of them.
+) -> list[Any]:
+    """Reconstruct the photographs incrementally and return the models, that with the most of them first.
+
+    Several come of photographs that fall apart, as of two places that nothing links.
 
     Args:
         database: with matches.
@@ -41,7 +43,7 @@ def map_photographs(
         start: folder of a model to go on from.
 
     Returns:
-        A ``pycolmap.Reconstruction``, or None.
+        Each a ``pycolmap.Reconstruction``; none where nothing fits together.
     """
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = 1
@@ -81,9 +83,14 @@ def map_photographs(
         initial_image_pair_callback=first_pair,
         next_image_callback=another,
     )
-    return max(models.values(), key=model_rank, default=None)
+    return sorted(models.values(), key=model_rank, reverse=True)
 
 
 def model_rank(model: Any) -> tuple[int, int]:
     """Return the sort key of models: the count of registered photographs, then of points."""
-    return (0, 0) if model is None else (model.num_reg_images(), model.num_points3D())
+    return (model.num_reg_images(), model.num_points3D())
+
+
+def best_rank(models: Sequence[Any]) -> tuple[int, int]:
+    """Return the sort key of what a mapping came to: that of its first model."""
+    return model_rank(models[0]) if models else (0, 0)
