@@ -67,7 +67,7 @@ def summarize_run(output: Path, exports: Iterable[str]) -> list[str]:
     placed, moved = poses.get("placed"), len(poses.get("moved", ()))
     return [
         *([f"Poses found for {placed} of {poses['photographs']} photographs"] if placed else []),
-        *([told] if (told := describe_other_models(output / POSES)) is not None else []),
+        *([sentence] if (sentence := describe_other_models(output / POSES)) is not None else []),
         *([f"Placed {moved} photograph{'s' if moved > 1 else ''} anew"] if moved else []),
         *(["Adjusted the lens of each photograph"] if poses.get("lenses") else []),
         format_mean_metrics(metrics),

@@ -83,8 +83,8 @@ def find_missing_poses(
 
 def warn_of_other_models(output: Path, progress: EventListener) -> None:
     """Tell of the models that were found beside the one that a run takes."""
-    if (told := describe_other_models(output / POSES)) is not None:
-        progress(Warned(told))
+    if (sentence := describe_other_models(output / POSES)) is not None:
+        progress(Warned(sentence))
 
 
 def _refuse_before_search(
