@@ -97,12 +97,12 @@ def extract_features(
     if thorough:  # fainter features, too
         options.sift.peak_threshold /= 3
     with pycolmap.Database.open(database) as found:
-        missing = [
+        missing = {
             image.name
             for image in found.read_all_images()
             if not (found.exists_keypoints(image.image_id) and found.exists_descriptors(image.image_id))
-        ]
-    wanted = [name for name in names if name in set(missing)]
+        }
+    wanted = [name for name in names if name in missing]
     there = len(names) - len(wanted)
     if there:
         on_count(there)

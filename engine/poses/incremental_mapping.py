@@ -52,6 +52,9 @@ def map_photographs(
     options.triangulation.random_seed = seed
     options.ba_use_gpu = False
     options.min_model_size = MIN_PHOTOGRAPHS
+    # It tries photographs whose points are not known yet by RANSAC of a solver that takes milliseconds, up to
+    # minutes for each photograph that matches falsely, as all do of another place.
+    options.structure_less_registration_fallback = False
     options.extract_colors = False  # extracted once, for the model that is kept
     if allow_weak_links:
         options.mapper.abs_pose_min_num_inliers = _WEAK_INLIERS

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from octasplat.engine.render.image_files import write_png
 
-WIDTH_PX, HEIGHT_PX, FOCAL_PX = 480, 360, 420.0
+WIDTH_PX, HEIGHT_PX, FOCAL_PX = 320, 240, 280.0
 SIDE_WORLD, TEXELS = 6.0, 768
 
 
