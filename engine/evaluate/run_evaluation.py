@@ -24,7 +24,7 @@ from octasplat.engine.files import read_metadata
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
 from octasplat.engine.gaussians.materials import has_materials
 from octasplat.engine.pathtracing.environment import EnvironmentMap, environment_frame
-from octasplat.engine.poses.find_poses import read_pose_record
+from octasplat.engine.poses.found_models import other_models, read_pose_record
 from octasplat.engine.render.environment_files import read_environment
 from octasplat.engine.render.renderer import background_color
 from octasplat.engine.runs.config import ReconstructionConfig, read_config
@@ -329,9 +329,18 @@ def _own_psnr(output: Path) -> float | None:
 
 
 def _pose_facts(output: Path) -> dict[str, object]:
-    """Return how many photographs have poses, how many were corrected, and whether lenses were adjusted."""
+    """Return how many photographs have poses, how many were corrected, and whether lenses were adjusted.
+
+    Also which models were found beside the one of the run, and how many photographs each has that this lacks.
+    """
     record = read_pose_record(output / POSES)
+    known: dict[str, object]
     known = {name: record[name] for name in ("placed", "photographs", "moved", "lenses") if name in record}
+    if others := other_models(output / POSES):
+        known["other_models"] = [
+            {"model": f"{POSES}/{other.number}", "placed": other.placed, "not_in_taken": len(other.names)}
+            for other in others
+        ]
     return {"poses": known} if known else {}
 
 

@@ -8,7 +8,9 @@ from typing import Any
 
 from octasplat.engine.core.durations import format_duration
 from octasplat.engine.core.georeference import Georeference
+from octasplat.engine.poses.found_models import describe_other_models
 from octasplat.engine.runs.result_files import file_label
+from octasplat.engine.runs.run_folder import POSES
 
 _METRICS = (
     ("psnr", "PSNR {:.2f} dB"),
@@ -65,6 +67,7 @@ def summarize_run(output: Path, exports: Iterable[str]) -> list[str]:
     placed, moved = poses.get("placed"), len(poses.get("moved", ()))
     return [
         *([f"Poses found for {placed} of {poses['photographs']} photographs"] if placed else []),
+        *([sentence] if (sentence := describe_other_models(output / POSES)) is not None else []),
         *([f"Placed {moved} photograph{'s' if moved > 1 else ''} anew"] if moved else []),
         *(["Adjusted the lens of each photograph"] if poses.get("lenses") else []),
         format_mean_metrics(metrics),

@@ -14,7 +14,7 @@ from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.relight import RelightOptions
 from octasplat.engine.operations.render import RenderOptions
 from octasplat.engine.operations.render_options import PictureOptions
-from octasplat.engine.poses.config import DEFAULT_CONFIG, MAX_IMAGE_SIDE_PX, PROPOSALS_PER_PHOTOGRAPH
+from octasplat.engine.poses.config import DEFAULT_CONFIG, MAX_IMAGE_SIDE_PX
 from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.runs.result_files import SURFACE_GLB
 from octasplat.engine.train.config import TrainConfig, iteration_count, max_gaussian_count, uses_shared_sort
@@ -27,7 +27,6 @@ _MAP_CPU_SECONDS_PER_PHOTOGRAPH = 0.2
 """For finding poses, measured with 14 photographs of 960 x 638 pixels and 25 of 538 x 960."""
 _LARGE_FEATURES_CPU_SECONDS_PER_PIXEL = 5.0e-7
 _LARGE_MATCH_CPU_SECONDS_PER_PAIR = 0.06
-_LARGE_PAIRS_PER_PARTNER = 0.7
 _LARGE_MAP_CPU_SECONDS_PER_PHOTOGRAPH = 0.5
 """The same in captures of more photographs than ``quick_look_up_to``."""
 _READ_CPU_SECONDS_PER_PIXEL = 1.8e-8
@@ -215,25 +214,20 @@ def _pose_search_cpu_seconds(photographs: Sequence[ImageSizes]) -> dict[str, flo
     pixels = sum(sizes.width_px * sizes.height_px * sizes.count for sizes in shrunk)
     full_pixels = sum(sizes.width_px * sizes.height_px * sizes.count for sizes in photographs)
     reading = _READ_CPU_SECONDS_PER_PIXEL * full_pixels
-    every_pair = count * (count - 1) // 2
+    looks, pairs = DEFAULT_CONFIG.expected_pairs(count)
+    looking = _PRESELECT_CPU_SECONDS_PER_PAIR * looks
     if DEFAULT_CONFIG.is_large(count):
-        pairs = min(every_pair, round(_LARGE_PAIRS_PER_PARTNER * count * DEFAULT_CONFIG.large_partners))
-        proposed = min(every_pair, count * PROPOSALS_PER_PHOTOGRAPH)
-        matching = _LARGE_MATCH_CPU_SECONDS_PER_PAIR * pairs
+        decoding = _DECODE_CPU_SECONDS_PER_PIXEL * full_pixels
         return {
             "read": reading,
-            "features": _LARGE_FEATURES_CPU_SECONDS_PER_PIXEL * pixels
-            + _DECODE_CPU_SECONDS_PER_PIXEL * full_pixels,
-            "matches": matching + _PRESELECT_CPU_SECONDS_PER_PAIR * proposed,
+            "features": _LARGE_FEATURES_CPU_SECONDS_PER_PIXEL * pixels + decoding,
+            "matches": _LARGE_MATCH_CPU_SECONDS_PER_PAIR * pairs + looking,
             "poses": _LARGE_MAP_CPU_SECONDS_PER_PHOTOGRAPH * count,
         }
-    is_exhaustive = count <= DEFAULT_CONFIG.exhaustive_up_to
-    pairs = every_pair if is_exhaustive else min(every_pair, count * DEFAULT_CONFIG.partners // 2)
-    preselected = 0 if is_exhaustive else every_pair
     return {
         "read": reading,
         "features": _FEATURES_CPU_SECONDS_PER_PIXEL * pixels,
-        "matches": _MATCH_CPU_SECONDS_PER_PAIR * pairs + _PRESELECT_CPU_SECONDS_PER_PAIR * preselected,
+        "matches": _MATCH_CPU_SECONDS_PER_PAIR * pairs + looking,
         "poses": _MAP_CPU_SECONDS_PER_PHOTOGRAPH * count,
     }
 

@@ -25,7 +25,12 @@ from octasplat.engine.runs.run_folder import (
     open_run_dataset,
     open_run_part,
 )
-from octasplat.engine.runs.run_poses import estimate_principal_points, find_missing_poses, repair_run_poses
+from octasplat.engine.runs.run_poses import (
+    estimate_principal_points,
+    find_missing_poses,
+    repair_run_poses,
+    warn_of_other_models,
+)
 from octasplat.engine.train.sampling.batches import BatchOptions, BatchSource
 
 
@@ -55,6 +60,8 @@ class FindPoses:
             progress=run.progress,
             should_stop=run.should_stop,
         )
+        if run.recorded is None:
+            warn_of_other_models(run.output, run.progress)
 
 
 class OpenDataset:

@@ -17,7 +17,7 @@ from octasplat.engine.core.relative_paths import normalize_name
 from octasplat.engine.core.versions import package_versions
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset.model_sources import has_model
-from octasplat.engine.poses.find_poses import read_pose_record
+from octasplat.engine.poses.found_models import read_pose_record
 from octasplat.engine.runs.config import ReconstructionConfig, read_config
 from octasplat.engine.runs.run_folder import BLOCKS, CACHE, CONFIG, EVENTS, POSES, START
 

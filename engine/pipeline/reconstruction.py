@@ -17,7 +17,7 @@ from octasplat.engine.pipeline.output_folder import claim_output, release_on_ref
 from octasplat.engine.pipeline.result_steps import EvaluateStep, ExportStep
 from octasplat.engine.pipeline.run import OnStep, ReconstructionRun, Step, run_steps
 from octasplat.engine.pipeline.run_lock import lock_run_folder
-from octasplat.engine.pipeline.start_scene import keep_start
+from octasplat.engine.pipeline.start_scene import keep_found_models, keep_start
 from octasplat.engine.pipeline.train_step import TrainStep
 from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.runs.run_folder import CACHE, EVENTS, SCENE, VIEWS
@@ -83,12 +83,14 @@ def reconstruct(
     if blocks is not None and (blocks.count or 1) > 1:  # of an automatic number it is known later
         require_blocks_possible(config)
     use_threads(threads)
+    config, found_by = config.without_run_of_model()
     # before the claim, which makes the folder
     is_made, is_new = not output.exists(), claim_output(scene, output, config, resume)
     with lock_run_folder(output):
         with release_on_refusal(output, is_new=is_new, is_made=is_made):
             blocks = keep_request(output, blocks, is_new=is_new)
             keep_start(scene, output, start_from, is_new=is_new)
+            keep_found_models(scene, output, found_by)
         _run_all_steps(
             ReconstructionRun(
                 scene=scene,

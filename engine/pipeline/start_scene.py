@@ -4,7 +4,6 @@ It is copied into the folder of the new run before anything else, so that the ru
 other one has gone on or is gone.
 """
 
-import shutil
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +23,7 @@ from octasplat.engine.files import read_metadata, read_scene
 from octasplat.engine.gaussians.channels import Channels
 from octasplat.engine.gaussians.merge import about_origin, with_sh_degree
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.poses.find_poses import read_pose_record
+from octasplat.engine.poses.found_models import copy_found_models, read_pose_record
 from octasplat.engine.poses.photographs import photographs_of_scene, photographs_sha256
 from octasplat.engine.runs.config import read_config
 from octasplat.engine.runs.finished_shading import finished_shading
@@ -235,6 +234,24 @@ def _shading_of_results(source: Path) -> dict[str, np.ndarray]:
         return {}
 
 
+def keep_found_models(scene: Path, output: Path, source: Path | None) -> None:
+    """Copy the models that another run has found, so that none are searched.
+
+    Args:
+        scene: folder of the photographs.
+        output: folder of the run.
+        source: folder of the other run; None for none.
+
+    Raises:
+        ConfigError: it has found none, or those of other photographs.
+    """
+    if source is None or (output / POSES).exists():
+        return
+    if "photographs_sha256" not in read_pose_record(source / POSES):
+        raise ConfigError(f"{source} holds no poses that a search has found; name the folder of such a run.")
+    _copy_found_poses(scene, output, source)
+
+
 def _copy_found_poses(scene: Path, output: Path, source: Path) -> None:
     """Copy poses that were found, as those of another search would be in another world."""
     digest = read_pose_record(source / POSES).get("photographs_sha256")
@@ -246,7 +263,7 @@ def _copy_found_poses(scene: Path, output: Path, source: Path) -> None:
             "anew would be in another world; give the same photographs, or a COLMAP model of these in that "
             "world."
         )
-    shutil.copytree(source / POSES, output / POSES)
+    copy_found_models(source / POSES, output / POSES)
 
 
 def _with_channels_for(

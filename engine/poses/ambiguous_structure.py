@@ -103,11 +103,12 @@ def _min_cut(weight: Float64[np.ndarray, "n n"]) -> Bool[np.ndarray, " n"]:
     _, vectors = np.linalg.eigh(np.diag(weight.sum(axis=1)) - weight)
     order = np.argsort(vectors[:, 0], kind="stable")
     side = np.zeros(len(weight), dtype=bool)
-    best, cut, across = side.copy(), np.inf, 0.0
+    best, cut = side.copy(), np.inf
+    across = 0.0
     # the best cut along its order, then single moves
     for photograph in order[:-1]:
-        row = weight[photograph]
-        across += float(row[~side].sum() - row[side].sum())
+        # only the photograph's own edges change sides; weights are whole numbers, so that sums are exact
+        across += float(weight[photograph].sum() - 2 * weight[photograph, side].sum())
         side[photograph] = True
         if across < cut:
             best, cut = side.copy(), across

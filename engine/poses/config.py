@@ -26,6 +26,10 @@ PRESELECTION_FEATURES = 511
 """Of a photograph, for the quick look that says which pairs are alike."""
 PROPOSALS_PER_PHOTOGRAPH = 100
 """Most photographs that one proposes for the quick look in a large capture; others may propose it."""
+_PAIRS_PER_PARTNER = 0.7
+"""Of a large capture: pairs that are matched, for each partner that a photograph may have."""
+MATCHES_PER_LOOK = 30
+"""Quick looks that take as long as matching one pair."""
 PRESELECTION_MATCHES = 12
 """By which two photographs are alike."""
 RETRY_BELOW_SHARE = 0.9
@@ -86,6 +90,21 @@ class PosesConfig(Settings):
     def is_large(self, photographs: int) -> bool:
         """Return whether a capture of so many photographs is searched with less effort for each of them."""
         return photographs > self.quick_look_up_to
+
+    def expected_pairs(self, photographs: int) -> tuple[int, int]:
+        """Return about how many pairs of photographs get a quick look, and how many of them are matched."""
+        every = photographs * (photographs - 1) // 2
+        if photographs <= self.exhaustive_up_to:
+            return 0, every
+        if not self.is_large(photographs):
+            return every, min(every, photographs * self.partners // 2)
+        looks = min(every, photographs * PROPOSALS_PER_PHOTOGRAPH)
+        return looks, min(looks, round(_PAIRS_PER_PARTNER * photographs * self.large_partners))
+
+    def quick_look_work_share(self, photographs: int) -> float:
+        """Return the share of the work of matching that the quick look takes; 0 where there is none."""
+        looks, matched = self.expected_pairs(photographs)
+        return looks / (looks + MATCHES_PER_LOOK * matched)
 
 
 DEFAULT_CONFIG = PosesConfig()

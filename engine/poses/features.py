@@ -31,6 +31,8 @@ from octasplat.engine.poses.pairs import (
 
 OnCount = Callable[[int], None]
 """Told how many are done."""
+OnLook = Callable[[int, float], None]
+"""Told how many pairs are known to be unlike, and what share of those to be looked at has been."""
 
 _PHOTOGRAPHS_PER_BATCH = 4
 _PHOTOGRAPHS_PER_IMPORT = 16
@@ -120,12 +122,12 @@ def extract_features(
     elif config.is_large(len(names)):
         options.sift.first_octave = 0  # not in the enlarged photograph: 2.5 times as fast
     with pycolmap.Database.open(database) as found:
-        missing = [
+        missing = {
             image.name
             for image in found.read_all_images()
             if not (found.exists_keypoints(image.image_id) and found.exists_descriptors(image.image_id))
-        ]
-    wanted = [name for name in names if name in set(missing)]
+        }
+    wanted = [name for name in names if name in missing]
     there = len(names) - len(wanted)
     if there:
         on_count(there)
@@ -189,7 +191,7 @@ def match_pairs(
 
 
 def preselect_pairs(
-    database: Path, names: Sequence[str], config: PosesConfig, *, threads: int, on_count: OnCount
+    database: Path, names: Sequence[str], config: PosesConfig, *, threads: int, on_look: OnLook
 ) -> list[Pair]:
     """Return pairs worth matching, by matching only the largest features of photographs.
 
@@ -201,11 +203,11 @@ def preselect_pairs(
         names: of the photographs, as they are numbered.
         config: settings.
         threads: to use; -1 means all cores.
-        on_count: hears of pairs that are not alike.
+        on_look: hears of pairs that are not alike.
     """
     small = database.with_name("quick.db")
     small.unlink(missing_ok=True)
-    _copy_largest_features(database, small, len(names), PRESELECTION_FEATURES)
+    copy_largest_features(database, small, len(names), PRESELECTION_FEATURES)
     options = pycolmap.FeatureMatchingOptions()
     options.num_threads = threads
     options.use_gpu = False
@@ -223,7 +225,7 @@ def preselect_pairs(
         proposed, partners = all_pairs(count), config.partners
     alike: dict[Pair, int] = {}
     looked = unlike = pair_count(count) - len(proposed)
-    on_count(unlike)
+    on_look(unlike, 0.0)
     for some in batch_pairs(proposed, _PRESELECTION_PAIRS_PER_BATCH):
         _match_pairs(small, names, some, options, verification)
         with pycolmap.Database.open(small) as found:
@@ -233,8 +235,9 @@ def preselect_pairs(
             first, second = pycolmap.pair_id_to_image_pair(pair_id)
             alike[first - 1, second - 1] = matches
         looked += len(some)
+        share = 1 - (pair_count(count) - looked) / len(proposed)
         unlike = looked - sum(matches >= PRESELECTION_MATCHES for matches in alike.values())
-        on_count(unlike)
+        on_look(unlike, share)
     small.unlink()
     return select_pairs(
         alike,
@@ -265,7 +268,8 @@ def _match_pairs(
     )
 
 
-def _copy_largest_features(database: Path, small: Path, photographs: int, count: int) -> None:
+def copy_largest_features(database: Path, small: Path, photographs: int, count: int) -> None:
+    """Make a database of so many photographs with the ``count`` largest features of each."""
     with pycolmap.Database.open(database) as source, pycolmap.Database.open(small) as target:
         for camera in source.read_all_cameras():
             target.write_camera(camera, use_camera_id=True)

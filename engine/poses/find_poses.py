@@ -32,6 +32,7 @@ from octasplat.engine.poses.config import (
     PosesConfig,
     PoseSearchRequest,
 )
+from octasplat.engine.poses.found_models import keep_other_models, read_pose_record
 from octasplat.engine.poses.photographs import photographs_of_scene, photographs_sha256
 
 _SEARCH_FILE = "search.json"
@@ -63,8 +64,10 @@ def find_poses(
 
     Args:
         images: folder of photographs, also in folders below it if it is called ``images``.
-        output: becomes the folder of the COLMAP model, with ``poses.json`` beside its files. What is needed
-            on the way lies in a hidden folder next to it, which is removed when the search ends.
+        output: becomes the folder of the COLMAP model, with ``poses.json`` beside its files. Where the
+            photographs fall apart, that is the model of most of them, and the others lie in folders below,
+            see :mod:`octasplat.engine.poses.found_models`. What is needed on the way lies in a hidden folder
+            next to it, which is removed when the search ends.
         names: of the photographs, relative to ``images``; None takes all.
         config: settings.
         threads: to use; 0 means all cores.
@@ -193,6 +196,7 @@ def adjust_principal_points(
         facts: dict[str, float] | None = read_pose_record(work / FOUND_FOLDER)["lenses"]
         if facts is not None:
             write_json(work / FOUND_FOLDER / RECORD_FILE, {**before, "lenses": facts})
+            keep_other_models(output, work / FOUND_FOLDER)
             if output.is_dir():  # the former model moves into the folder for the work, which is removed
                 output.rename(work / "before")
             (work / FOUND_FOLDER).rename(output)
@@ -232,15 +236,6 @@ def _stopped_search(work: Path) -> dict[str, Any] | None:
     except (OSError, ValueError):
         return None
     return search
-
-
-def read_pose_record(output: Path) -> dict[str, Any]:
-    """Return the record of estimated poses and their photographs; empty if there is none."""
-    try:
-        record: dict[str, Any] = json.loads((output / RECORD_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return record
 
 
 class _ColmapProcess:

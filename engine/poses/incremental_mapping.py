@@ -5,7 +5,7 @@ now and then other photographs; most of the mapper runs on one thread anyway.
 """
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,8 +38,10 @@ def map_photographs(
     is_large: bool = False,
     allow_weak_links: bool = False,
     start: Path | None = None,
-) -> Any:
-    """Reconstruct the photographs incrementally and return the model with the most of them.
+) -> list[Any]:
+    """Reconstruct the photographs incrementally and return the models, that with the most of them first.
+
+    Several come of photographs that fall apart, as of two places that nothing links.
 
     Args:
         database: with matches.
@@ -51,7 +53,7 @@ def map_photographs(
         start: folder of a model to go on from.
 
     Returns:
-        A ``pycolmap.Reconstruction``, or None.
+        Each a ``pycolmap.Reconstruction``; none where nothing fits together.
     """
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = 1
@@ -60,6 +62,9 @@ def map_photographs(
     options.triangulation.random_seed = seed
     options.ba_use_gpu = False
     options.min_model_size = MIN_PHOTOGRAPHS
+    # It tries photographs whose points are not known yet by RANSAC of a solver that takes milliseconds, up to
+    # minutes for each photograph that matches falsely, as all do of another place.
+    options.structure_less_registration_fallback = False
     options.extract_colors = False  # extracted once, for the model that is kept
     if is_large:
         options.ba_global_frames_ratio = options.ba_global_points_ratio = _LARGE_GROWTH
@@ -96,9 +101,14 @@ def map_photographs(
         initial_image_pair_callback=first_pair,
         next_image_callback=another,
     )
-    return max(models.values(), key=model_rank, default=None)
+    return sorted(models.values(), key=model_rank, reverse=True)
 
 
 def model_rank(model: Any) -> tuple[int, int]:
     """Return the sort key of models: the count of registered photographs, then of points."""
-    return (0, 0) if model is None else (model.num_reg_images(), model.num_points3D())
+    return (model.num_reg_images(), model.num_points3D())
+
+
+def best_rank(models: Sequence[Any]) -> tuple[int, int]:
+    """Return the sort key of what a mapping came to: that of its first model."""
+    return model_rank(models[0]) if models else (0, 0)

@@ -5,12 +5,12 @@ By GPS where the photographs have it, else by a vocabulary of the capture's own 
 2016, describes its index); neighbors by name always. The quick look decides.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 
 from octasplat.engine.poses.config import PROPOSALS_PER_PHOTOGRAPH
 from octasplat.engine.poses.pairs import Pair, neighbor_pairs
@@ -39,14 +39,35 @@ def propose_pairs(database: Path, small: Path, count: int, *, seed: int, threads
         threads: to use for GPS; -1 means all cores.
     """
     found = neighbor_pairs(count, NEIGHBORS_BY_NAME)
+    without = list(range(1, count + 1))
     with pycolmap.Database.open(database) as photographs:
-        located = sum(prior.has_position() for prior in photographs.read_all_pose_priors())
-        by_gps = located >= MIN_GPS_SHARE * count
-        if by_gps:
+        located = gps_positions_m(photographs)
+        if len(located) >= MIN_GPS_SHARE * count:
             found |= _nearest_by_gps(photographs, threads)
-    if not by_gps:
-        found |= _alike_by_vocabulary(small, count, seed)
+            without = [number for number in without if number not in located]
+    if without:
+        for number, alike in alike_by_vocabulary(small, count, without, PROPOSALS_PER_PHOTOGRAPH, seed=seed):
+            found |= {(min(number, other) - 1, max(number, other) - 1) for other in alike}
     return sorted(found)
+
+
+def gps_positions_m(photographs: "pycolmap.Database") -> dict[int, Float64[np.ndarray, "3"]]:
+    """Return the places on the ground of the photographs that have GPS, by their numbers.
+
+    They are from the middle of the earth, at an altitude of zero, as altitudes are far less sure. A latitude
+    and longitude of zero are what cameras write that know no place.
+    """
+    known = {
+        prior.corr_data_id.id: np.array([*prior.position[:2], 0.0])
+        for prior in photographs.read_all_pose_priors()
+        if prior.has_position()
+        and prior.coordinate_system == pycolmap.PosePriorCoordinateSystem.WGS84
+        and np.any(prior.position[:2] != 0)
+    }
+    if not known:
+        return {}
+    places_m = pycolmap.GPSTransform().ellipsoid_to_ecef(np.stack([known[number] for number in known]))
+    return dict(zip(known, np.asarray(places_m), strict=True))
 
 
 def _nearest_by_gps(photographs: "pycolmap.Database", threads: int) -> set[Pair]:
@@ -57,12 +78,23 @@ def _nearest_by_gps(photographs: "pycolmap.Database", threads: int) -> set[Pair]
     return _as_pairs(pycolmap.SpatialPairGenerator(options, photographs).all_pairs())
 
 
-def _alike_by_vocabulary(small: Path, count: int, seed: int) -> set[Pair]:
+def alike_by_vocabulary(
+    small: Path, count: int, queries: Sequence[int], most: int, *, seed: int
+) -> Iterator[tuple[int, list[int]]]:
+    """Yield photographs by their numbers, each with those that are most alike by a vocabulary, in order.
+
+    Args:
+        small: database of the photographs with their largest features only.
+        count: photographs in all.
+        queries: numbers of those to yield.
+        most: photographs for each of them.
+        seed: of the vocabulary.
+    """
     index_file = small.with_name("vocabulary.bin")
     with pycolmap.Database.open(small) as photographs:
         descriptors = _drawn_descriptors(photographs, count, seed)
         if len(descriptors) < 2 * DESCRIPTORS_PER_WORD:
-            return set()
+            return
         words = min(MAX_WORDS, len(descriptors) // DESCRIPTORS_PER_WORD)
         options = pycolmap.VisualIndex.BuildOptions()
         options.num_visual_words = words
@@ -79,11 +111,15 @@ def _alike_by_vocabulary(small: Path, count: int, seed: int) -> set[Pair]:
         index.write(index_file)
         pairing = pycolmap.VocabTreePairingOptions()
         pairing.vocab_tree_path = index_file
-        pairing.num_images = PROPOSALS_PER_PHOTOGRAPH
+        pairing.num_images = most
         pairing.num_threads = 1
-        found = _as_pairs(pycolmap.VocabTreePairGenerator(pairing, photographs).all_pairs())
+        generator = pycolmap.VocabTreePairGenerator(pairing, photographs, list(queries))
+        while not generator.has_finished():
+            # pairs of one photograph with those that it asks for, the most alike first
+            pairs = [pair for pair in generator.next() if pair[0] != pair[1]]
+            if pairs:
+                yield pairs[0][0], [other for _, other in pairs]
     index_file.unlink()
-    return found
 
 
 def _drawn_descriptors(

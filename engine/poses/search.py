@@ -9,7 +9,9 @@ from typing import Any
 import pycolmap
 
 from octasplat.engine.core.errors import DatasetError
-from octasplat.engine.core.events import EventListener, Warned
+from octasplat.engine.core.events import EventListener, PhaseProgress, Warned
+from octasplat.engine.core.name_lists import name_list
+from octasplat.engine.core.progress import phase
 from octasplat.engine.core.scene_layout import MIN_PHOTOGRAPHS
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset.image_info import ImageInfo
@@ -19,9 +21,6 @@ from octasplat.engine.poses.config import (
     FEATURES,
     MAPPING_STAGE,
     MATCHES,
-    MAX_REPROJECTION_PX,
-    MIN_POINTS,
-    PROPOSALS_PER_PHOTOGRAPH,
     READING,
     RECORD_FILE,
     RETRY_BELOW_SHARE,
@@ -35,7 +34,10 @@ from octasplat.engine.poses.features import (
     photographs_of,
     preselect_pairs,
 )
-from octasplat.engine.poses.incremental_mapping import map_photographs, model_rank
+from octasplat.engine.poses.found_models import write_other_models
+from octasplat.engine.poses.incremental_mapping import best_rank, map_photographs, model_rank
+from octasplat.engine.poses.linking_pairs import NEIGHBORS_BY_NAME, propose_links
+from octasplat.engine.poses.model_selection import distinct_models, is_trustworthy, model_facts
 from octasplat.engine.poses.pairs import Pair, all_pairs, pair_count, pairs_with
 from octasplat.engine.poses.photograph_check import check_photographs_decode
 from octasplat.engine.poses.workspace import link_photographs, progress_stage
@@ -94,8 +96,8 @@ class PoseSearch:
             DatasetError: too few photographs have poses, or these do not fit.
         """
         count, config = len(self._names), self._config
-        best = self._search(thorough=False)
-        placed = model_rank(best)[0]
+        models = self._search(thorough=False)
+        placed = best_rank(models)[0]
         if placed < count and (count <= config.exhaustive_up_to or placed < RETRY_BELOW_SHARE * count):
             self._progress(
                 Warned(
@@ -104,28 +106,23 @@ class PoseSearch:
                 )
             )
             # max keeps the first of equals: the usual search
-            best = max(best, self._search(thorough=True), key=model_rank)
-        self._check_model(best)
-        # One after the other: colors are sums.
-        best.extract_colors_for_all_images(self._photographs, num_threads=1)
+            models = max(models, self._search(thorough=True), key=best_rank)
+        self._check_models(models)
         names = dict(zip(self._aliases, self._names, strict=True))
-        for image in best.images.values():
-            image.name = names[image.name]
         found.mkdir(exist_ok=True)
-        best.write_binary(found)
-        posed = {best.image(number).name for number in best.reg_image_ids()}
-        write_json(
-            found / RECORD_FILE,
-            {
-                "photographs": len(self._all_names),
-                "placed": len(posed),
-                "left_out": [name for name in self._all_names if name not in posed],
-                "points": best.num_points3D(),
-                "mean_reprojection_px": round(float(best.compute_mean_reprojection_error()), 4),
-            },
-        )
+        for number, model in enumerate(distinct_models(models)):
+            # One after the other: colors are sums.
+            model.extract_colors_for_all_images(self._photographs, num_threads=1)
+            for image in model.images.values():
+                image.name = names[image.name]
+            folder = found / str(number) if number else found
+            folder.mkdir(exist_ok=True)
+            model.write_binary(folder)
+            write_json(folder / RECORD_FILE, model_facts(model, self._all_names))
+        write_other_models(found)
 
-    def _search(self, *, thorough: bool) -> Any:
+    def _search(self, *, thorough: bool) -> list[Any]:
+        """Return the models that the photographs come to, that of most photographs first."""
         database = self._work / ("thorough.db" if thorough else DATABASE)
         self._find_features(database, thorough)
         matched = self._match(database, thorough)
@@ -133,15 +130,15 @@ class PoseSearch:
         # Mapping adds and removes matches: a search that is stopped in it goes on from what was matched.
         database = Path(shutil.copyfile(database, self._work / "mapping.db"))
         with progress_stage(MAPPING_STAGE, count, self._progress) as at:
-            best = self._disambiguate(
+            models = self._disambiguate(
                 database,
                 self._map(database, at),
                 at,
             )
-            if model_rank(best)[0] < count:
-                best = self._register_remaining(database, best, matched, at)
-            at(model_rank(best)[0])
-        return best
+            if best_rank(models)[0] < count:
+                models = self._register_remaining(database, models, matched, at)
+            at(best_rank(models)[0])
+        return models
 
     def _find_features(self, database: Path, thorough: bool) -> None:
         with progress_stage(FEATURES, len(self._names), self._progress) as at:
@@ -168,33 +165,40 @@ class PoseSearch:
             )
 
     def _match(self, database: Path, thorough: bool) -> list[Pair]:
-        count = len(self._names)
-        total = pair_count(count)
-        with progress_stage(MATCHES, total, self._progress) as at:
-            if count > self._config.exhaustive_up_to:
+        config, count = self._config, len(self._names)
+        total, look_share = pair_count(count), config.quick_look_work_share(count)
+
+        def tell(settled: int, work_done: float) -> None:
+            self._progress(PhaseProgress(MATCHES, settled, total, work_done=work_done))
+
+        with phase(MATCHES, self._progress, total):
+            pairs = [] if look_share else all_pairs(count)
+            if look_share:
                 pairs = preselect_pairs(
-                    database, self._aliases, self._config, threads=self._threads, on_count=at
+                    database,
+                    self._aliases,
+                    config,
+                    threads=self._threads,
+                    on_look=lambda unlike, looked: tell(unlike, look_share * looked),
                 )
-            else:
-                pairs = all_pairs(count)
-            unlike = total - len(pairs)
+            unlike, wanted = total - len(pairs), max(len(pairs), 1)
             match_pairs(
                 database,
                 self._aliases,
                 pairs,
-                self._config,
+                config,
                 thorough=thorough,
                 threads=self._threads,
-                on_count=lambda done: at(unlike + done),
+                on_count=lambda done: tell(unlike + done, look_share + (1 - look_share) * done / wanted),
             )
         return pairs
 
-    def _disambiguate(self, database: Path, model: Any, at: Callable[[int], None]) -> Any:
-        """Return the model rebuilt without the false matches of its folds, repeated while it has any."""
+    def _disambiguate(self, database: Path, models: list[Any], at: Callable[[int], None]) -> list[Any]:
+        """Return the models rebuilt without the false matches of its folds, repeated while it has any."""
         for _ in range(_MAX_DISAMBIGUATIONS):
-            if model is None:
+            if not models:
                 break
-            votes = count_pair_inliers(model, database)
+            votes = count_pair_inliers(models[0], database)
             false = find_false_pairs(votes)
             if len(false) == 0:
                 break
@@ -203,27 +207,32 @@ class PoseSearch:
             shutil.copyfile(database, trial)
             remove_pairs(trial, false)
             again = self._map(trial, at)
-            if model_rank(again)[0] < model_rank(model)[0]:
+            if best_rank(again)[0] < best_rank(models)[0]:
                 break
             # fewer matches explained: the cut was no fold
-            if count_pair_inliers(again, trial).inliers.sum() <= votes.inliers.sum():
+            if count_pair_inliers(again[0], trial).inliers.sum() <= votes.inliers.sum():
                 break
             trial.replace(database)
-            model = again
-        return model
+            models = again
+        return models
 
     def _register_remaining(
-        self, database: Path, best: Any, matched: list[Pair], at: Callable[[int], None]
-    ) -> Any:
-        """Register photographs that were left out, with fewer matches required.
+        self, database: Path, models: list[Any], matched: list[Pair], at: Callable[[int], None]
+    ) -> list[Any]:
+        """Register photographs that the largest model leaves out, with fewer matches required.
 
-        They are matched with all others, in a large capture with those that are near by name.
+        They are matched with all others; in a large capture with those that are near by name, and with those
+        of the largest model that are near by GPS or look most alike.
         """
-        posed = set() if best is None else {number - 1 for number in best.reg_image_ids()}
+        posed = {number - 1 for number in models[0].reg_image_ids()} if models else set[int]()
         count = len(self._names)
         rest = [k for k in range(count) if k not in posed]
-        is_large = self._config.is_large(count)
-        more = pairs_with(rest, count, matched, within=PROPOSALS_PER_PHOTOGRAPH if is_large else None)
+        if self._config.is_large(count):
+            near = pairs_with(rest, count, matched, within=NEIGHBORS_BY_NAME)
+            links = propose_links(database, rest, posed, matched, seed=self._config.seed)
+            more = sorted({*near, *links})
+        else:
+            more = pairs_with(rest, count, matched)
         if more:
             match_pairs(
                 database,
@@ -235,12 +244,13 @@ class PoseSearch:
                 on_count=lambda _done: None,
             )
         start = None
-        if best is not None:
+        if models:
             start = self._work / "start"
             start.mkdir(exist_ok=True)
-            best.write_binary(start)
+            models[0].write_binary(start)
         again = self._map(database, at, allow_weak_links=True, start=start)
-        return max(best, again, key=model_rank)
+        # max keeps the first of equals
+        return max(models, again, key=best_rank)
 
     def _map(
         self,
@@ -249,7 +259,7 @@ class PoseSearch:
         *,
         allow_weak_links: bool = False,
         start: Path | None = None,
-    ) -> Any:
+    ) -> list[Any]:
         return map_photographs(
             database,
             self._photographs,
@@ -336,22 +346,24 @@ class PoseSearch:
                 )
             )
 
-    def _check_model(self, best: Any) -> None:
+    def _check_models(self, models: Sequence[Any]) -> None:
         """Refuse a result that would only waste the training."""
         count, config = len(self._names), self._config
-        if best is None:
+        if not models:
             raise DatasetError(
                 "No poses were found: the photographs do not overlap enough, or are blurred or plain; "
                 "take more of them from nearby places, or send a COLMAP model."
             )
-        posed, points = model_rank(best)
+        posed, points = model_rank(models[0])
         advice = (
             "take more photographs with more overlap, of things that stand still, or send a COLMAP model."
         )
         if posed < max(MIN_PHOTOGRAPHS, config.min_share * count):
-            raise DatasetError(f"Only {posed} of {count} photographs could be placed; {advice}")
-        error_px = float(best.compute_mean_reprojection_error())
-        if points < MIN_POINTS or not error_px <= MAX_REPROJECTION_PX:
+            raise DatasetError(
+                f"Only {posed} of {count} photographs could be placed{self._describe_parts(models)}; {advice}"
+            )
+        error_px = float(models[0].compute_mean_reprojection_error())
+        if not is_trustworthy(models[0]):
             raise DatasetError(
                 f"The poses are not to be trusted ({points} points, {error_px:.1f} px mean error); {advice}"
             )
@@ -359,6 +371,16 @@ class PoseSearch:
             self._progress(
                 Warned(f"{count - posed} of {count} photographs could not be placed and are left out.")
             )
+
+    def _describe_parts(self, models: Sequence[Any]) -> str:
+        """Return which other models there are, for a sentence; empty where there are none."""
+        names = dict(zip(self._aliases, self._names, strict=True))
+        parts = [
+            (model.num_reg_images(), sorted(names[model.image(k).name] for k in model.reg_image_ids()))
+            for model in distinct_models(models)[1:]
+        ]
+        listed = ", ".join(f"{placed} ({name_list(which)})" for placed, which in parts)
+        return f" together, apart from models of {listed} that no matches link" if parts else ""
 
 
 def _read_image_infos(images: Path, names: Sequence[str]) -> dict[str, ImageInfo]:

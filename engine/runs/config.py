@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError, model_validator
 
 from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.poses.found_models import parse_found_model
 from octasplat.engine.runs.run_settings import RunSettings
 from octasplat.engine.settings.base import Settings
 from octasplat.engine.settings.fields import ADVANCED
@@ -72,11 +73,19 @@ class ReconstructionConfig(RunSettings):
             "not cover a photograph; leave the background of the evaluation out."
         )
 
+    def without_run_of_model(self) -> "tuple[ReconstructionConfig, Path | None]":
+        """Return the settings with a found model named without the run that has found it, and that run."""
+        named = parse_found_model(self.model)
+        if named is None or named[0] is None:
+            return self, None
+        return self.model_copy(update={"model": f"poses/{named[1]}"}), named[0]
+
     def with_poses_decided(self, has_model: bool) -> "ReconstructionConfig":
         """Return the settings with ``poses`` resolved for a dataset with or without a COLMAP model."""
         if self.poses != "missing":
             return self
-        return self.model_copy(update={"poses": "given" if has_model else "auto"})
+        is_given = has_model and parse_found_model(self.model) is None
+        return self.model_copy(update={"poses": "given" if is_given else "auto"})
 
 
 def resolve_config(

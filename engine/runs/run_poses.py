@@ -16,13 +16,18 @@ from octasplat.engine.poses.config import GivenModel
 from octasplat.engine.poses.find_poses import (
     adjust_principal_points,
     find_poses,
-    read_pose_record,
     repair_poses,
+)
+from octasplat.engine.poses.found_models import (
+    choose_found_model,
+    describe_other_models,
+    parse_found_model,
+    read_pose_record,
 )
 from octasplat.engine.poses.lens_check import needs_per_view_principal_points
 from octasplat.engine.poses.photographs import photographs_of_scene
 from octasplat.engine.runs.config import ReconstructionConfig
-from octasplat.engine.runs.run_folder import POSES, found_model_folder
+from octasplat.engine.runs.run_folder import POSES, START, found_model_folder
 from octasplat.engine.train.config import Background, iteration_count
 from octasplat.engine.train.loop.trial_training import COARSE_ITERATIONS, train_coarse_scene
 from octasplat.engine.train.sampling.batches import evaluation_background
@@ -42,12 +47,16 @@ def find_missing_poses(
 ) -> None:
     """Estimate the poses of a run's photographs, if requested and not done yet.
 
+    Of several models that are found, the one that the configuration names is taken, else that of most
+    photographs; a run that begins with a scene keeps the model of that one.
+
     Raises:
-        DatasetError: there are no photographs, or their poses cannot be found.
+        DatasetError: there are no photographs, their poses cannot be found, or the model that is named is not
+            there.
         ColmapCrashError: COLMAP died.
         CancelledError: stopped as asked.
     """
-    if config.poses == "given" or (config.poses == "missing" and has_model(scene)):
+    if config.with_poses_decided(has_model(scene)).poses == "given":
         return
     names = photographs_of_scene(scene)
     if not (output / POSES).is_dir():  # a search that has begun was let through before
@@ -60,6 +69,21 @@ def find_missing_poses(
         progress=progress,
         should_stop=should_stop,
     )
+    named = parse_found_model(config.model)
+    if (output / START).is_dir():
+        if named is not None and named[1] != read_pose_record(output / POSES).get("number", 0):
+            raise DatasetError(
+                f"The scene that this run begins with stands in the world of another model than "
+                f"{config.model}; leave --model or --start-from out."
+            )
+    else:
+        choose_found_model(output / POSES, 0 if named is None else named[1])
+
+
+def warn_of_other_models(output: Path, progress: EventListener) -> None:
+    """Tell of the models that were found beside the one that a run takes."""
+    if (sentence := describe_other_models(output / POSES)) is not None:
+        progress(Warned(sentence))
 
 
 def _refuse_before_search(scene: Path, names: Sequence[str], config: ReconstructionConfig) -> None:

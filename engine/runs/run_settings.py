@@ -62,7 +62,8 @@ class RunSettings(BaseModel):
         None,
         min_length=1,
         description="Which of several models of the dataset gives the poses: its folder or its number, e.g. "
-        "sparse/1, or transforms.json; by default the COLMAP model of most photographs.",
+        "sparse/1, or transforms.json; by default the COLMAP model of most photographs. Of models that a "
+        "search for poses finds: poses/1, or with the run that has found it, OUT/poses/1.",
     )
     masks: Annotated[Literal["ignore", "alpha"], ADVANCED] = Field(
         "ignore",

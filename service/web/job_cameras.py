@@ -1,5 +1,6 @@
 """Cameras of a job for the 3D view: of its results, of a training under way, or of its photographs."""
 
+import re
 from pathlib import PurePosixPath
 from typing import Any
 
@@ -17,6 +18,7 @@ from octasplat.workers.db.live_scenes import LiveScene
 from octasplat.workers.db.rows import Artifact, DatasetFile
 from octasplat.workers.storage.errors import StorageError
 
+_POSES_FILE = re.compile(r"poses/(sparse/0/)?[^/]+")
 MAX_UNPLACED = 1000
 """Most names of photographs without a place that are listed."""
 
@@ -63,7 +65,11 @@ def _posed_cameras(
     if content and (poses := read_view_poses(content)):
         nearest = read_json(service.storage, by_name.get(TRAINING)).get("nearest_world")
         return _viewer_content(poses, names, nearest if isinstance(nearest, dict) else {})
-    found = {PurePosixPath(row.name).name: row.sha256 for row in artifacts if row.name.startswith("poses/")}
+    found = {
+        PurePosixPath(row.name).name: row.sha256
+        for row in artifacts
+        if _POSES_FILE.fullmatch(row.name)  # in numbered folders lie models that are not taken
+    }
     if not found:
         found = {name: row.sha256 for name, row in _model_files(files).items()}
     for suffix in (".bin", ".txt"):

@@ -145,7 +145,8 @@ def reconstruct(
             poses, by COLMAP's features, matching and mapping; missing does so only where the dataset
             holds no model. Default: missing.
         model: Which of several models of the dataset gives the poses: its folder or its number, e.g.
-            sparse/1, or transforms.json; by default the COLMAP model of most photographs.
+            sparse/1, or transforms.json; by default the COLMAP model of most photographs. Of models
+            that a search for poses finds: poses/1, or with the run that has found it, OUT/poses/1.
         masks: What masks mean: ignore leaves masked pixels out of the loss, alpha takes the mask as the
             alpha, for objects that are cut out. Default: ignore.
         depth_unit: World units for one unit of the values of depth maps (depths/); by default the
@@ -309,7 +310,8 @@ def estimate(
             poses, by COLMAP's features, matching and mapping; missing does so only where the dataset
             holds no model. Default: missing.
         model: Which of several models of the dataset gives the poses: its folder or its number, e.g.
-            sparse/1, or transforms.json; by default the COLMAP model of most photographs.
+            sparse/1, or transforms.json; by default the COLMAP model of most photographs. Of models
+            that a search for poses finds: poses/1, or with the run that has found it, OUT/poses/1.
         masks: What masks mean: ignore leaves masked pixels out of the loss, alpha takes the mask as the
             alpha, for objects that are cut out. Default: ignore.
         depth_unit: World units for one unit of the values of depth maps (depths/); by default the
@@ -466,7 +468,8 @@ def plan(
             poses, by COLMAP's features, matching and mapping; missing does so only where the dataset
             holds no model. Default: missing.
         model: Which of several models of the dataset gives the poses: its folder or its number, e.g.
-            sparse/1, or transforms.json; by default the COLMAP model of most photographs.
+            sparse/1, or transforms.json; by default the COLMAP model of most photographs. Of models
+            that a search for poses finds: poses/1, or with the run that has found it, OUT/poses/1.
         masks: What masks mean: ignore leaves masked pixels out of the loss, alpha takes the mask as the
             alpha, for objects that are cut out. Default: ignore.
         depth_unit: World units for one unit of the values of depth maps (depths/); by default the

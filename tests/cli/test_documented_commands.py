@@ -1,5 +1,6 @@
 """The commands of the documentation run, on a scene of some hundred Gaussians and with small pictures."""
 
+import json
 import shlex
 import shutil
 from collections.abc import Sequence
@@ -13,6 +14,7 @@ from click.testing import CliRunner
 import octasplat as osp
 from octasplat.__main__ import cli
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
+from octasplat.engine.poses.photographs import photographs_of_scene, photographs_sha256
 from octasplat.engine.render.environment_files import write_environment
 from octasplat.engine.render.image_files import write_png
 from tests.support.documentation import DOCS, ROOT, DocumentedCommand, commands
@@ -146,6 +148,8 @@ def add_scenes(folder: Path, run: Path, words: Sequence[str]) -> None:
         shutil.copy(run / "scene.ply", folder / name)
     for name in ("edited.ply", "part.ply", "frames/0.ply", "frames/1.ply"):
         shutil.copy(run / "mesh.ply", folder / name)
+    if any(word.startswith("OUT/poses/") for word in words):  # as a search finds them in more photographs
+        write_found_poses(folder / "SCENE", folder / "OUT" / "poses")
     if any(word.startswith("THINGS/") for word in words):  # of a benchmark, which takes minutes
         shutil.copytree(folder / "SCENE", folder / "THINGS" / "kettle")
     mask = np.zeros((36, 48, 3), np.float32)
@@ -160,6 +164,16 @@ def add_scenes(folder: Path, run: Path, words: Sequence[str]) -> None:
         write_places(folder / "SCENE")
     if "-o" in words:
         remove(folder / words[words.index("-o") + 1])
+
+
+def write_found_poses(scene: Path, poses: Path) -> None:
+    """Write the model of a scene as the first and the second that a search has found."""
+    names = photographs_of_scene(scene)
+    for target in (poses, poses / "1"):
+        shutil.copytree(scene / "sparse" / "0", target, dirs_exist_ok=True)
+        record = {"photographs": len(names), "placed": len(names), "left_out": []}
+        digest = {"photographs_sha256": photographs_sha256(scene / "images", names)}
+        (target / "poses.json").write_text(json.dumps({**record, **digest}), encoding="utf-8")
 
 
 def write_places(scene: Path) -> None:

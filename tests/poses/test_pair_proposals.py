@@ -57,14 +57,15 @@ def test_vocabulary_proposes_photographs_of_one_place(
     assert {(k, k + 1) for k in range(COUNT - 1)} <= set(proposed)
     assert not path.with_name("vocabulary.bin").exists()
 
-    told: list[int] = []
-    quick = PosesConfig(quick_look_up_to=10, partners=6, neighbours=1)
-    chosen = preselect_pairs(path, names, quick, threads=1, on_count=told.append)
+    told: list[tuple[int, float]] = []
+    quick = PosesConfig(quick_look_up_to=10, large_partners=6, neighbours=1)
+    chosen = preselect_pairs(path, names, quick, threads=1, on_look=lambda *look: told.append(look))
     whole = preselect_pairs(
-        path, names, PosesConfig(partners=6, neighbours=1), threads=1, on_count=lambda _: None
+        path, names, PosesConfig(partners=6, neighbours=1), threads=1, on_look=lambda _unlike, _share: None
     )
     assert len(set(chosen) & set(whole)) >= 0.97 * len(whole)
-    assert told == sorted(told) and told[0] == pair_count(COUNT) - len(proposed)
+    assert told == sorted(told) and told[0] == (pair_count(COUNT) - len(proposed), 0.0)
+    assert told[-1][1] == 1.0
 
 
 def test_gps_proposes_what_was_taken_nearby(

@@ -338,7 +338,8 @@ class Workspace:
             return self.stored_frames.checkpoint_names()
         with UntrustedFolder(self.folder) as folder:
             names = [name for name in _CHECKPOINT_FILES if folder.is_file(name)]
-            poses = sorted(_directly_below(folder, f"{RUN_FOLDER}/{POSES_FOLDER}"))
+            found = f"{RUN_FOLDER}/{POSES_FOLDER}"  # further models lie in folders below
+            poses = sorted(f"{found}/{name}" for name in folder.names(found))
             checkpoints = _directly_below(folder, f"{RUN_FOLDER}/checkpoints")
             pieces = list(_piece_files(folder, self._own_block))
         if self._own_block is not None:  # all else is the whole job's

@@ -200,6 +200,12 @@ def _complete(
 ) -> ReconstructJobConfig:
     """Return the settings of a job: those of its run, of its blocks, and what it begins with."""
     check_block_options(BlockOptions(blocks=blocks, memory=memory), config)
+    if config.without_run_of_model()[1] is not None:
+        detail = (
+            "A job finds the models itself and knows no folders of other machines; name one without a folder "
+            "before it, such as poses/1."
+        )
+        raise InvalidSettingsError([Refusal(("model",), "model", detail)])
     others = {"blocks": blocks, "memory": memory, _START: begins_with_source}
     job = ReconstructJobConfig.model_validate({**config.model_dump(mode="json"), **others})
     if job.begins_with_source and job.blocks is not None:

@@ -1,0 +1,49 @@
+"""The models of a mapping that are worth to be kept, and what is recorded of each."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from octasplat.engine.core.scene_layout import MIN_PHOTOGRAPHS
+from octasplat.engine.poses.config import MAX_REPROJECTION_PX, MIN_POINTS
+
+
+def distinct_models(models: Sequence[Any]) -> list[Any]:
+    """Return the first model, and each further one that places photographs which no model before it does.
+
+    It must do so with enough of them for a training, and be as sure as the first one has to be.
+
+    Args:
+        models: ``pycolmap.Reconstruction`` each, that of most photographs first.
+    """
+    kept = list(models[:1])
+    posed = {number for model in kept for number in model.reg_image_ids()}
+    for model in models[1:]:
+        new = set(model.reg_image_ids()) - posed
+        if len(new) >= MIN_PHOTOGRAPHS and is_trustworthy(model):
+            kept.append(model)
+            posed |= new
+    return kept
+
+
+def is_trustworthy(model: Any) -> bool:
+    """Return whether a model has enough points, and these fit the photographs."""
+    return model.num_points3D() >= MIN_POINTS and (
+        float(model.compute_mean_reprojection_error()) <= MAX_REPROJECTION_PX
+    )
+
+
+def model_facts(model: Any, names: Sequence[str]) -> dict[str, Any]:
+    """Return what is recorded of a found model.
+
+    Args:
+        model: a ``pycolmap.Reconstruction`` whose images have the names of photographs.
+        names: of all photographs.
+    """
+    posed = {model.image(number).name for number in model.reg_image_ids()}
+    return {
+        "photographs": len(names),
+        "placed": len(posed),
+        "left_out": [name for name in names if name not in posed],
+        "points": model.num_points3D(),
+        "mean_reprojection_px": round(float(model.compute_mean_reprojection_error()), 4),
+    }
