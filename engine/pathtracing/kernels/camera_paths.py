@@ -42,22 +42,20 @@ def _fill_camera_samples(
 
 
 @njit_no_refcount(forceinline=True, fastmath={"contract"})
-def _pixel_direction(directions: Float32[np.ndarray, "h w 3"], y: int, x: int, u: float, v: float) -> Vec3:
-    """Return the direction through (u, v) of a pixel, by the slopes between its neighbours."""
+def _pixel_slopes(directions: Float32[np.ndarray, "h w 3"], y: int, x: int) -> tuple[Vec3, Vec3]:
+    """Return how the direction changes over the width and the height of a pixel, by its neighbors."""
     height, width, _ = directions.shape
-    centre = directions[y, x]
     left, right = max(x - 1, 0), min(x + 1, width - 1)
     high, low = max(y - 1, 0), min(y + 1, height - 1)
     # two pixels apart, or one at the picture's edges
-    along = (u - 0.5) * (0.5 if right - left == 2 else 1.0)
-    down = (v - 0.5) * (0.5 if low - high == 2 else 1.0)
+    along = 0.5 if right - left == 2 else 1.0
+    down = 0.5 if low - high == 2 else 1.0
     a, b = directions[y, left], directions[y, right]
     c, d = directions[high, x], directions[low, x]
-    d_x, d_y, d_z = float(centre[0]), float(centre[1]), float(centre[2])
-    d_x += along * (b[0] - a[0]) + down * (d[0] - c[0])
-    d_y += along * (b[1] - a[1]) + down * (d[1] - c[1])
-    d_z += along * (b[2] - a[2]) + down * (d[2] - c[2])
-    return normalize(d_x, d_y, d_z)
+    return (
+        (along * (b[0] - a[0]), along * (b[1] - a[1]), along * (b[2] - a[2])),
+        (down * (d[0] - c[0]), down * (d[1] - c[1]), down * (d[2] - c[2])),
+    )
 
 
 @njit_no_refcount(forceinline=True, fastmath={"contract"})
@@ -94,11 +92,12 @@ def start_paths(
     directions, axis = camera.directions_world, camera.axis
     width = directions.shape[1]
     across_x, across_y, across_z, up_x, up_y, up_z = orthonormal_basis(axis[0], axis[1], axis[2])
-    # --- the pixel: its place in the order, the number of the path in it, row and column ---
+    # --- the pixel: its place in the order, the number of the path in it, direction and slopes ---
     pairs = CAMERA_SAMPLE_PAIRS if camera.aperture > 0.0 else 1  # without a lens none for the place on it
     place, number = first // start.paths_per_pixel, first % start.paths_per_pixel - 1
     pixel = start.pixel_order[start.first_pixel + place]
-    y, x = pixel // width, pixel % width
+    centre = directions[pixel // width, pixel % width]
+    (a_x, a_y, a_z), (b_x, b_y, b_z) = _pixel_slopes(directions, pixel // width, pixel % width)
     for k in range(first, last):
         n = (k - first) % BLOCK_SIZE
         number += 1
@@ -106,15 +105,18 @@ def start_paths(
             place, number = place + 1, 0
         if n == 0:
             _fill_camera_samples(scratch, integrator.seed, start, place, number, last - k, pairs)
-        if n == 0 or number == 0:
+        if number == 0:
             pixel = start.pixel_order[start.first_pixel + place]
-            y, x = pixel // width, pixel % width
+            centre = directions[pixel // width, pixel % width]
+            (a_x, a_y, a_z), (b_x, b_y, b_z) = _pixel_slopes(directions, pixel // width, pixel % width)
         paths.keys[k], paths.samples[k] = scratch.keys[n], scratch.samples[n]
         # --- a place in the pixel ---
-        centre = directions[y, x]
         d_x, d_y, d_z = float(centre[0]), float(centre[1]), float(centre[2])
         if integrator.anti_aliasing:
-            d_x, d_y, d_z = _pixel_direction(directions, y, x, numbers[0, 0, n], numbers[0, 1, n])
+            u, v = numbers[0, 0, n] - 0.5, numbers[0, 1, n] - 0.5
+            d_x, d_y, d_z = normalize(
+                d_x + u * a_x + v * b_x, d_y + u * a_y + v * b_y, d_z + u * a_z + v * b_z
+            )
         # --- a place on the lens ---
         o_x, o_y, o_z = camera.origin_world[0], camera.origin_world[1], camera.origin_world[2]
         if camera.aperture > 0.0:

@@ -96,7 +96,9 @@ def sample_light_index(
     """
     count = len(lights.kinds)
     if count == 1:
-        return (0, 1.0) if _light_weight(lights, 0, p_x, p_y, p_z, is_mesh) > 0.0 else (-1, 0.0)
+        # where a light does not shine its sample brings nothing to a mesh
+        shines = lights.lights_meshes[0] != 0 if is_mesh else light_importance(lights, 0, p_x, p_y, p_z) > 0.0
+        return (0, 1.0) if shines else (-1, 0.0)
     total = 0.0
     for l in range(count):
         total += _light_weight(lights, l, p_x, p_y, p_z, is_mesh)
@@ -116,6 +118,8 @@ def sample_light_index(
 @njit_no_refcount(forceinline=True, fastmath={"contract"})
 def light_probability(lights: LightArrays, light_id: int, p_x: float, p_y: float, p_z: float) -> float:
     """Return the probability with which :func:`sample_light_index` asks a light at p, on a mesh."""
+    if len(lights.kinds) == 1:
+        return 1.0 if lights.lights_meshes[0] else 0.0
     total, own = 0.0, 0.0
     for l in range(len(lights.kinds)):
         weight = _light_weight(lights, l, p_x, p_y, p_z, True)

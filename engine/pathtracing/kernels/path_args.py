@@ -12,6 +12,8 @@ BLOCK_SIZE = 1024
 """Rows that a thread works on at a time: few enough for the nearest cache."""
 CAMERA_SAMPLE_PAIRS = 2
 """Pairs of uniform numbers that a path uses at the camera: one for the pixel, one for the lens."""
+SHADING_ROWS = 128
+"""Rows whose points of surfaces a thread works out at a time, before it shades them."""
 SAMPLE_PAIRS_PER_BOUNCE = 5
 """Pairs of uniform numbers that a path uses at each surface."""
 MAX_NESTED = 4
@@ -182,6 +184,7 @@ class PathScratch(NamedTuple):
         distances: of what they met.
         faces: likewise.
         barycentrics: likewise.
+        surface_points: place, normal, shading normal and cosine to the viewer of some of the rows.
     """
 
     embree: Float32[np.ndarray, " w"]
@@ -197,6 +200,7 @@ class PathScratch(NamedTuple):
     distances: Float32[np.ndarray, " b"]
     faces: Int32[np.ndarray, " b"]
     barycentrics: Float32[np.ndarray, "b 2"]
+    surface_points: Float64[np.ndarray, "s 10"]
 
 
 class CameraRays(NamedTuple):
@@ -285,12 +289,13 @@ def allocate_path_scratch(threads: int) -> list[PathScratch]:
     return [
         PathScratch(
             allocate_embree_scratch(1)[0], np.empty(BLOCK_SIZE, np.uint32), np.empty(BLOCK_SIZE, np.int32),
-            np.empty((SAMPLE_PAIRS_PER_BOUNCE - 1, 2, BLOCK_SIZE)), np.empty(BLOCK_SIZE, np.int32),
+            np.empty((SAMPLE_PAIRS_PER_BOUNCE - 1, 2, BLOCK_SIZE)),
+            np.empty(BLOCK_SIZE + 1, np.int32),  # what sorts them writes behind the last one
             np.empty((BLOCK_SIZE, 3), np.float32), np.empty((BLOCK_SIZE, 3), np.float32),
             np.empty(BLOCK_SIZE, np.float32), np.empty(BLOCK_SIZE, np.float32),
             np.empty(BLOCK_SIZE, np.bool_),
             np.empty(BLOCK_SIZE, np.float32), np.empty(BLOCK_SIZE, np.int32),
-            np.empty((BLOCK_SIZE, 2), np.float32),
+            np.empty((BLOCK_SIZE, 2), np.float32), np.empty((SHADING_ROWS, 10)),
         )
         for _ in range(threads)
     ]  # fmt: skip

@@ -31,6 +31,7 @@ from octasplat.engine.pathtracing.kernels.path_args import (
     CAMERA_SAMPLE_PAIRS,
     PATH_ENDED,
     SAMPLE_PAIRS_PER_BOUNCE,
+    SHADING_ROWS,
     Bounce,
     LightQuery,
     PathArrays,
@@ -66,33 +67,48 @@ from octasplat.engine.pathtracing.kernels.surface import (
 )
 from octasplat.engine.trace.kernels.native import njit_no_refcount, prefetch
 
-PREFETCH_ROWS = 16
-"""How far ahead of their use the rows of faces are asked for."""
 _LAST_WORD = 4 * 8
 """Bytes before the last number of three corners."""
 
 
-@njit_no_refcount(forceinline=True, fastmath={"contract"})
+@njit_no_refcount(forceinline=True)
+def _sort_hits(scratch: PathScratch, scene: MeshScene, faces: Int32[np.ndarray, " n"], first: int, last: int) -> int:
+    """Write those of the rows ``first`` to ``last``, at most a block, that meet a face, by kind of material.
+
+    One kind after the other, so that neighbors take the same way through the code; returns how many there are.
+    """
+    found, kinds, rows = scratch.samples, scratch.faces, scratch.rows  # the first two are free here
+    hits = 0
+    for k in range(first, last):
+        found[hits] = k
+        hits += faces[k] >= 0
+    for i in range(hits):
+        kinds[i] = scene.materials.kinds[scene.surfaces.material_ids[faces[found[i]]]]
+    count = 0
+    for kind in range(EMITTER + 1):
+        # no branch: which kind comes next is not to be foreseen
+        for i in range(hits):
+            rows[count] = found[i]
+            count += kinds[i] == kind
+    return count
+
+
+@njit_no_refcount(forceinline=True)
 def _fill_samples(
     scratch: PathScratch,
     paths: PathArrays,
     active: Int32[np.ndarray, " n"],
-    faces: Int32[np.ndarray, " n"],
-    first: int,
-    last: int,
+    count: int,
     first_pair: int,
     light_count: int,
 ) -> None:
-    """Fill in the numbers of those of the rows ``first`` to ``last``, at most a block, that meet a face.
+    """Fill in the numbers of the ``count`` rows of :func:`_sort_hits`, in their order.
 
     Where there is no choice of lights there are no numbers for it.
     """
-    count = 0
-    for k in range(first, last):
-        if faces[k] >= 0:
-            p = active[k]
-            scratch.keys[count], scratch.samples[count] = paths.keys[p], paths.samples[p]
-            count += 1
+    for i in range(count):
+        p = active[scratch.rows[i]]
+        scratch.keys[i], scratch.samples[i] = paths.keys[p], paths.samples[p]
     for pair in range(len(scratch.random_numbers)):
         if pair != LIGHT_CHOICE_SAMPLE or light_count > 1:
             fill_pair(
@@ -189,6 +205,87 @@ def _scatter_at_material(
     scatter_path(p, samples, paths, kind == DIFFUSE, off_surface, bsdf, tables, query)
 
 
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
+def _write_surface_points(scratch: PathScratch, first: int, last: int, bounce: Bounce) -> None:
+    """Write what the shading of the rows at the places ``first`` to ``last`` of the sorted ones begins with.
+
+    Nothing here depends on materials: without branches the processor works on several rows at a time.
+    """
+    surfaces, paths = bounce.scene.surfaces, bounce.paths
+    for i in range(first, last):
+        k = scratch.rows[i]
+        p, face, out = bounce.active[k], bounce.hits.faces[k], scratch.surface_points[i - first]
+        d_x, d_y, d_z = paths.directions_world[p, 0], paths.directions_world[p, 1], paths.directions_world[p, 2]
+        b, c = float(bounce.hits.barycentrics[k, 0]), float(bounce.hits.barycentrics[k, 1])
+        a = 1.0 - b - c
+        corners = surfaces.corners_world[face]
+        n_x, n_y, n_z = face_normal(corners)
+        facing = -(d_x * n_x + d_y * n_y + d_z * n_z)
+        # from here on the normal is on the viewer's side
+        side = 1.0 if facing >= 0.0 else -1.0
+        n_x, n_y, n_z = side * n_x, side * n_y, side * n_z
+        out[0], out[1], out[2] = interpolate_corners(corners, a, b, c)
+        out[3], out[4], out[5] = n_x, n_y, n_z
+        out[6], out[7], out[8] = shading_normal(
+            surfaces.corner_normals[face], a, b, c, n_x, n_y, n_z, d_x, d_y, d_z
+        )
+        out[9] = facing
+
+
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
+def _shade_hit(scratch: PathScratch, bounce: Bounce, k: int, n: int, place: int) -> None:
+    """Shade row ``k`` with the random numbers ``n``; its surface point is that at ``place``."""
+    paths, active, depth, hits, scene, integrator, shadows = bounce
+    surfaces, materials, lights = scene.surfaces, scene.materials, scene.lights
+    p, face, at = active[k], hits.faces[k], scratch.surface_points[place]
+    b, c = float(hits.barycentrics[k, 0]), float(hits.barycentrics[k, 1])
+    a = 1.0 - b - c
+    normal, facing = (at[3], at[4], at[5]), at[9]
+    m = surfaces.material_ids[face]
+    kind = materials.kinds[m]
+    # Beer's law, on the way inside of glass up to this hit
+    if paths.medium_ids[p] >= 0:
+        medium = materials.absorption[paths.medium_ids[p]]
+        for channel in range(3):
+            paths.throughput[p, channel] *= math.exp(-medium[channel] * hits.distances[k])
+    is_guide = paths.flags[p] & FLAG_CAMERA_RAY != 0 and paths.mesh_visibility[p] == 0.0
+    goes_on = kind != EMITTER and depth < integrator.max_depth
+    if is_guide:
+        paths.mesh_visibility[p] = paths.transmittance[p]
+        # white until the material is known; mirrors and glass stay so
+        if goes_on:
+            _write_denoiser_guides(paths, p, 1.0, 1.0, 1.0, at[6], at[7], at[8])
+        else:
+            side = 1.0 if facing >= 0.0 else -1.0
+            n_x, n_y, n_z = normal
+            _write_denoiser_guides(paths, p, 1.0, 1.0, 1.0, side * n_x, side * n_y, side * n_z)
+    # --- light that the surface sends by itself ---
+    l = materials.light_ids[m]
+    if kind == EMITTER:
+        shade_emitter(paths, p, lights, l, hits.distances[k], facing, 0.0, 0.0, integrator)
+    elif l >= 0:
+        u_t, v_t = interpolate_uv(surfaces.corner_uv[face], a, b, c)
+        # meshes shine on both sides
+        shade_emitter(paths, p, lights, l, hits.distances[k], abs(facing), u_t, v_t, integrator)
+    if not goes_on:
+        paths.is_alive[p] = False
+        return
+    # --- the way on ---
+    samples = PathSamples(scratch.random_numbers, n)
+    if depth >= integrator.roulette_depth and not survives_roulette(
+        paths, p, sample_pair(samples, LOBE_SAMPLE)[1]
+    ):
+        return
+    query = LightQuery(lights, integrator, shadows, k)
+    shadows.medium_ids[k] = paths.medium_ids[p]
+    if scene.any_nested:
+        copy_media(paths.media[p], shadows.media[k])
+    point = SurfacePoint((at[0], at[1], at[2]), normal, (at[6], at[7], at[8]))
+    _scatter_at_material(
+        paths, p, scene, face, (a, b, c), facing >= 0.0, point, is_guide, samples, query
+    )  # fmt: skip
+
+
 @kernel(_nrt=False, error_model="numpy", fastmath={"contract"})
 def shade_surfaces(first: int, last: int, scratch: PathScratch, bounce: Bounce) -> None:
     """Shade what paths find at the end of their rays.
@@ -197,78 +294,30 @@ def shade_surfaces(first: int, last: int, scratch: PathScratch, bounce: Bounce) 
     the shadow rays. Paths that end are not alive any more.
     """
     paths, active, depth, hits, scene, integrator, shadows = bounce
-    surfaces, materials, lights = scene.surfaces, scene.materials, scene.lights
+    surfaces, lights = scene.surfaces, scene.lights
     first_pair = CAMERA_SAMPLE_PAIRS + depth * SAMPLE_PAIRS_PER_BOUNCE
-    n = 0
-    for k in range(first, last):
-        if (k - first) % BLOCK_SIZE == 0:
-            end = min(k + BLOCK_SIZE, last)
-            _fill_samples(scratch, paths, active, hits.faces, k, end, first_pair, len(lights.kinds))
-            n = -1
-        if k + PREFETCH_ROWS < last:
-            _prefetch_face(surfaces, hits.faces[k + PREFETCH_ROWS])
-        p, face = active[k], hits.faces[k]
-        shadows.radiance_linear[k, 0] = shadows.radiance_linear[k, 1] = shadows.radiance_linear[k, 2] = 0.0
-        if face == PATH_ENDED:
-            continue
-        # what lies behind a passed surface of glass is found by this path alone: it shadows light queries
-        if scene.any_nested and copy_media(hits.media[k], paths.media[p]):
-            paths.pdf[p] = 0.0
-        # --- nothing was met ---
-        if face < 0:
-            shade_miss(paths, p, lights, scene.environment, integrator)
-            paths.is_alive[p] = False
-            continue
-        n += 1
-        # --- the point: weights a, b, c of the corners, the face's normal, the medium up to there ---
-        d = paths.directions_world[p]
-        b, c = float(hits.barycentrics[k, 0]), float(hits.barycentrics[k, 1])
-        a = 1.0 - b - c
-        n_x, n_y, n_z = face_normal(surfaces.corners_world[face])
-        facing = -(d[0] * n_x + d[1] * n_y + d[2] * n_z)
-        m = surfaces.material_ids[face]
-        kind = materials.kinds[m]
-        # Beer's law, on the way inside of glass up to this hit
-        if paths.medium_ids[p] >= 0:
-            medium = materials.absorption[paths.medium_ids[p]]
-            for channel in range(3):
-                paths.throughput[p, channel] *= math.exp(-medium[channel] * hits.distances[k])
-        is_guide = paths.flags[p] & FLAG_CAMERA_RAY != 0 and paths.mesh_visibility[p] == 0.0
-        if is_guide:
-            paths.mesh_visibility[p] = paths.transmittance[p]
-            # white until the material is known; mirrors and glass stay so
-            _write_denoiser_guides(paths, p, 1.0, 1.0, 1.0, n_x, n_y, n_z)
-        # --- light that the surface sends by itself ---
-        l = materials.light_ids[m]
-        if kind == EMITTER:
-            shade_emitter(paths, p, lights, l, hits.distances[k], facing, 0.0, 0.0, integrator)
-        elif l >= 0:
-            u_t, v_t = interpolate_uv(surfaces.corner_uv[face], a, b, c)
-            # meshes shine on both sides
-            shade_emitter(paths, p, lights, l, hits.distances[k], abs(facing), u_t, v_t, integrator)
-        if kind == EMITTER or depth >= integrator.max_depth:
-            paths.is_alive[p] = False
-            continue
-        # --- the way on ---
-        point = interpolate_corners(surfaces.corners_world[face], a, b, c)
-        # from here on the normal is on the viewer's side
-        if facing < 0.0:
-            n_x, n_y, n_z = -n_x, -n_y, -n_z
-        s_x, s_y, s_z = shading_normal(
-            surfaces.corner_normals[face], a, b, c, n_x, n_y, n_z, d[0], d[1], d[2]
-        )
-        if is_guide:
-            _write_denoiser_guides(paths, p, 1.0, 1.0, 1.0, s_x, s_y, s_z)
-        samples = PathSamples(scratch.random_numbers, n)
-        if depth >= integrator.roulette_depth and not survives_roulette(
-            paths, p, sample_pair(samples, LOBE_SAMPLE)[1]
-        ):
-            continue
-        query = LightQuery(lights, integrator, shadows, k)
-        shadows.medium_ids[k] = paths.medium_ids[p]
-        if scene.any_nested:
-            copy_media(paths.media[p], shadows.media[k])
-        _scatter_at_material(
-            paths, p, scene, face, (a, b, c), facing >= 0.0,
-            SurfacePoint(point, (n_x, n_y, n_z), (s_x, s_y, s_z)), is_guide, samples, query,
-        )  # fmt: skip
+    for start in range(first, last, BLOCK_SIZE):
+        end = min(start + BLOCK_SIZE, last)
+        # --- rays that meet nothing ---
+        for k in range(start, end):
+            face = hits.faces[k]
+            shadows.radiance_linear[k, 0] = shadows.radiance_linear[k, 1] = shadows.radiance_linear[k, 2] = 0.0
+            if face == PATH_ENDED:
+                continue
+            p = active[k]
+            # what lies behind a passed surface of glass is found by this path alone: it shadows light queries
+            if scene.any_nested and copy_media(hits.media[k], paths.media[p]):
+                paths.pdf[p] = 0.0
+            if face < 0:
+                shade_miss(paths, p, lights, scene.environment, integrator)
+                paths.is_alive[p] = False
+        # --- rays that meet a face, a kind of material after the other ---
+        count = _sort_hits(scratch, scene, hits.faces, start, end)
+        _fill_samples(scratch, paths, active, count, first_pair, len(lights.kinds))
+        for begin in range(0, count, SHADING_ROWS):
+            stop = min(begin + SHADING_ROWS, count)
+            for i in range(begin, stop):
+                _prefetch_face(surfaces, hits.faces[scratch.rows[i]])
+            _write_surface_points(scratch, begin, stop, bounce)
+            for i in range(begin, stop):
+                _shade_hit(scratch, bounce, scratch.rows[i], i, i - begin)
