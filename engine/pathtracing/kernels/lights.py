@@ -289,14 +289,14 @@ def sample_light(
         way_y += a * lights.sides_u[l, 1] + b * lights.sides_v[l, 1]
         way_z += a * lights.sides_u[l, 2] + b * lights.sides_v[l, 2]
     squared = max(way_x * way_x + way_y * way_y + way_z * way_z, 1e-20)
+    along = -(axis[0] * way_x + axis[1] * way_y + axis[2] * way_z)  # distance times cosine at a rectangle
     distance = math.sqrt(squared)
     inverse = 1.0 / distance
     way_x, way_y, way_z = inverse * way_x, inverse * way_y, inverse * way_z
     if kind == RECTANGLE:
-        cosine = -(axis[0] * way_x + axis[1] * way_y + axis[2] * way_z)
-        if cosine <= 1e-9:
+        if along <= 1e-9 * distance:
             return way_x, way_y, way_z, distance, 0.0, 0.0, 0.0, 1.0
-        pdf = squared / (cosine * lights.areas[l])
+        pdf = squared * distance / (along * lights.areas[l])
         return way_x, way_y, way_z, distance, rgb[0], rgb[1], rgb[2], pdf
     falloff = 1.0 / squared
     if kind == SPOT:

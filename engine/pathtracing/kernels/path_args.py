@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt32
 
 from octasplat.engine.pathtracing.kernels.kernel_args import IntegratorParameters, LightArrays, MeshScene
+from octasplat.engine.pathtracing.kernels.surface_point_vectors import LANES, SURFACE_POINT_ROWS
 from octasplat.engine.trace.triangle_bvh import allocate_embree_scratch
 
 BLOCK_SIZE = 1024
@@ -184,7 +185,7 @@ class PathScratch(NamedTuple):
         distances: of what they met.
         faces: likewise.
         barycentrics: likewise.
-        surface_points: place, normal, shading normal and cosine to the viewer of some of the rows.
+        surface_points: of some of the rows, see :mod:`.surface_point_vectors`.
     """
 
     embree: Float32[np.ndarray, " w"]
@@ -200,7 +201,7 @@ class PathScratch(NamedTuple):
     distances: Float32[np.ndarray, " b"]
     faces: Int32[np.ndarray, " b"]
     barycentrics: Float32[np.ndarray, "b 2"]
-    surface_points: Float64[np.ndarray, "s 10"]
+    surface_points: Float64[np.ndarray, "10 s"]
 
 
 class CameraRays(NamedTuple):
@@ -290,12 +291,12 @@ def allocate_path_scratch(threads: int) -> list[PathScratch]:
         PathScratch(
             allocate_embree_scratch(1)[0], np.empty(BLOCK_SIZE, np.uint32), np.empty(BLOCK_SIZE, np.int32),
             np.empty((SAMPLE_PAIRS_PER_BOUNCE - 1, 2, BLOCK_SIZE)),
-            np.empty(BLOCK_SIZE + 1, np.int32),  # what sorts them writes behind the last one
+            np.empty(BLOCK_SIZE + LANES, np.int32),  # the last ones may be repeated to fill a vector
             np.empty((BLOCK_SIZE, 3), np.float32), np.empty((BLOCK_SIZE, 3), np.float32),
             np.empty(BLOCK_SIZE, np.float32), np.empty(BLOCK_SIZE, np.float32),
             np.empty(BLOCK_SIZE, np.bool_),
             np.empty(BLOCK_SIZE, np.float32), np.empty(BLOCK_SIZE, np.int32),
-            np.empty((BLOCK_SIZE, 2), np.float32), np.empty((SHADING_ROWS, 10)),
+            np.empty((BLOCK_SIZE, 2), np.float32), np.empty((SURFACE_POINT_ROWS, SHADING_ROWS)),
         )
         for _ in range(threads)
     ]  # fmt: skip

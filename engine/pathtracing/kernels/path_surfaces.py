@@ -21,6 +21,7 @@ from octasplat.engine.pathtracing.kernels.kernel_args import (
     AlbedoTables,
     Bsdf,
     MeshScene,
+    Rgb,
     SurfaceArrays,
     SurfacePoint,
     Vec3,
@@ -58,13 +59,11 @@ from octasplat.engine.pathtracing.kernels.surface import (
     eval_material,
     eval_normal_map,
     eval_vertex_color,
-    face_normal,
     has_textures,
-    interpolate_corners,
     interpolate_uv,
     offset_ray_origin,
-    shading_normal,
 )
+from octasplat.engine.pathtracing.kernels.surface_point_vectors import LANES, write_surface_points8
 from octasplat.engine.trace.kernels.native import njit_no_refcount, prefetch
 
 _LAST_WORD = 4 * 8
@@ -76,6 +75,7 @@ def _sort_hits(scratch: PathScratch, scene: MeshScene, faces: Int32[np.ndarray, 
     """Write those of the rows ``first`` to ``last``, at most a block, that meet a face, by kind of material.
 
     One kind after the other, so that neighbors take the same way through the code; returns how many there are.
+    The last row is repeated to fill a vector.
     """
     found, kinds, rows = scratch.samples, scratch.faces, scratch.rows  # the first two are free here
     hits = 0
@@ -90,6 +90,8 @@ def _sort_hits(scratch: PathScratch, scene: MeshScene, faces: Int32[np.ndarray, 
         for i in range(hits):
             rows[count] = found[i]
             count += kinds[i] == kind
+    for i in range(count, count + LANES - 1):
+        rows[i] = rows[count - 1]
     return count
 
 
@@ -130,16 +132,13 @@ def _prefetch_face(surfaces: SurfaceArrays, face: int) -> None:
 
 @njit_no_refcount(forceinline=True, fastmath={"contract"})
 def _write_denoiser_guides(
-    paths: PathArrays, p: int, red: float, green: float, blue: float, n_x: float, n_y: float, n_z: float
+    paths: PathArrays, p: int, albedo: Rgb, normal: Vec3
 ) -> None:
     """Write color and normal of the first mesh that the camera's ray hits, weighted by visibility."""
     share = paths.mesh_visibility[p]
-    paths.albedo_linear[p, 0] = share * red
-    paths.albedo_linear[p, 1] = share * green
-    paths.albedo_linear[p, 2] = share * blue
-    paths.normals_world[p, 0] = share * n_x
-    paths.normals_world[p, 1] = share * n_y
-    paths.normals_world[p, 2] = share * n_z
+    for channel in range(3):
+        paths.albedo_linear[p, channel] = share * albedo[channel]
+        paths.normals_world[p, channel] = share * normal[channel]
 
 
 @njit_no_refcount(forceinline=True, fastmath={"contract"})
@@ -189,7 +188,7 @@ def _scatter_at_material(
         (float(d[0]), float(d[1]), float(d[2])),
     )  # fmt: skip
     if is_guide:
-        _write_denoiser_guides(paths, p, red, green, blue, s_x, s_y, s_z)
+        _write_denoiser_guides(paths, p, (red, green, blue), (s_x, s_y, s_z))
     table = materials.coat_tables[m]
     coat, coat_roughness = eval_clear_coat(materials, m, u_t, v_t)
     bsdf = Bsdf(
@@ -205,31 +204,22 @@ def _scatter_at_material(
     scatter_path(p, samples, paths, kind == DIFFUSE, off_surface, bsdf, tables, query)
 
 
-@njit_no_refcount(forceinline=True, fastmath={"contract"})
+@njit_no_refcount(forceinline=True)
 def _write_surface_points(scratch: PathScratch, first: int, last: int, bounce: Bounce) -> None:
     """Write what the shading of the rows at the places ``first`` to ``last`` of the sorted ones begins with.
 
-    Nothing here depends on materials: without branches the processor works on several rows at a time.
+    Nothing here depends on materials.
     """
-    surfaces, paths = bounce.scene.surfaces, bounce.paths
-    for i in range(first, last):
-        k = scratch.rows[i]
-        p, face, out = bounce.active[k], bounce.hits.faces[k], scratch.surface_points[i - first]
-        d_x, d_y, d_z = paths.directions_world[p, 0], paths.directions_world[p, 1], paths.directions_world[p, 2]
-        b, c = float(bounce.hits.barycentrics[k, 0]), float(bounce.hits.barycentrics[k, 1])
-        a = 1.0 - b - c
-        corners = surfaces.corners_world[face]
-        n_x, n_y, n_z = face_normal(corners)
-        facing = -(d_x * n_x + d_y * n_y + d_z * n_z)
-        # from here on the normal is on the viewer's side
-        side = 1.0 if facing >= 0.0 else -1.0
-        n_x, n_y, n_z = side * n_x, side * n_y, side * n_z
-        out[0], out[1], out[2] = interpolate_corners(corners, a, b, c)
-        out[3], out[4], out[5] = n_x, n_y, n_z
-        out[6], out[7], out[8] = shading_normal(
-            surfaces.corner_normals[face], a, b, c, n_x, n_y, n_z, d_x, d_y, d_z
-        )
-        out[9] = facing
+    surfaces, points = bounce.scene.surfaces, scratch.surface_points
+    row_bytes = points.shape[1] * points.itemsize
+    for i in range(first, last, LANES):
+        write_surface_points8(
+            scratch.rows.ctypes.data + i * scratch.rows.itemsize,
+            bounce.active.ctypes.data, bounce.hits.faces.ctypes.data, bounce.hits.barycentrics.ctypes.data,
+            bounce.paths.directions_world.ctypes.data,
+            surfaces.corners_world.ctypes.data, surfaces.corner_normals.ctypes.data,
+            points.ctypes.data + (i - first) * points.itemsize, row_bytes,
+        )  # fmt: skip
 
 
 @njit_no_refcount(forceinline=True, fastmath={"contract"})
@@ -237,10 +227,13 @@ def _shade_hit(scratch: PathScratch, bounce: Bounce, k: int, n: int, place: int)
     """Shade row ``k`` with the random numbers ``n``; its surface point is that at ``place``."""
     paths, active, depth, hits, scene, integrator, shadows = bounce
     surfaces, materials, lights = scene.surfaces, scene.materials, scene.lights
-    p, face, at = active[k], hits.faces[k], scratch.surface_points[place]
+    # unsigned: no place is counted from the end of an array
+    p, face, at = np.uintp(active[k]), np.uintp(hits.faces[k]), scratch.surface_points
+    position = at[0, place], at[1, place], at[2, place]
+    normal, shading_normal = (at[3, place], at[4, place], at[5, place]), (at[6, place], at[7, place], at[8, place])
+    facing = at[9, place]
     b, c = float(hits.barycentrics[k, 0]), float(hits.barycentrics[k, 1])
     a = 1.0 - b - c
-    normal, facing = (at[3], at[4], at[5]), at[9]
     m = surfaces.material_ids[face]
     kind = materials.kinds[m]
     # Beer's law, on the way inside of glass up to this hit
@@ -254,11 +247,11 @@ def _shade_hit(scratch: PathScratch, bounce: Bounce, k: int, n: int, place: int)
         paths.mesh_visibility[p] = paths.transmittance[p]
         # white until the material is known; mirrors and glass stay so
         if goes_on:
-            _write_denoiser_guides(paths, p, 1.0, 1.0, 1.0, at[6], at[7], at[8])
+            _write_denoiser_guides(paths, p, (1.0, 1.0, 1.0), shading_normal)
         else:
             side = 1.0 if facing >= 0.0 else -1.0
             n_x, n_y, n_z = normal
-            _write_denoiser_guides(paths, p, 1.0, 1.0, 1.0, side * n_x, side * n_y, side * n_z)
+            _write_denoiser_guides(paths, p, (1.0, 1.0, 1.0), (side * n_x, side * n_y, side * n_z))
     # --- light that the surface sends by itself ---
     l = materials.light_ids[m]
     if kind == EMITTER:
@@ -280,7 +273,7 @@ def _shade_hit(scratch: PathScratch, bounce: Bounce, k: int, n: int, place: int)
     shadows.medium_ids[k] = paths.medium_ids[p]
     if scene.any_nested:
         copy_media(paths.media[p], shadows.media[k])
-    point = SurfacePoint((at[0], at[1], at[2]), normal, (at[6], at[7], at[8]))
+    point = SurfacePoint(position, normal, shading_normal)
     _scatter_at_material(
         paths, p, scene, face, (a, b, c), facing >= 0.0, point, is_guide, samples, query
     )  # fmt: skip
@@ -320,4 +313,4 @@ def shade_surfaces(first: int, last: int, scratch: PathScratch, bounce: Bounce) 
                 _prefetch_face(surfaces, hits.faces[scratch.rows[i]])
             _write_surface_points(scratch, begin, stop, bounce)
             for i in range(begin, stop):
-                _shade_hit(scratch, bounce, scratch.rows[i], i, i - begin)
+                _shade_hit(scratch, bounce, np.uintp(scratch.rows[i]), i, i - begin)
