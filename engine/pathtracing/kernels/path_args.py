@@ -6,7 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt32
 
 from octasplat.engine.pathtracing.kernels.kernel_args import IntegratorParameters, LightArrays, MeshScene
-from octasplat.engine.pathtracing.kernels.surface_point_vectors import LANES, SURFACE_POINT_ROWS
+from octasplat.engine.pathtracing.kernels.surface_point_vectors import SURFACE_POINT_ROWS
+from octasplat.engine.trace.cpu.kernels.simd_vector import LANES
 from octasplat.engine.trace.triangle_bvh import allocate_embree_scratch
 
 BLOCK_SIZE = 1024

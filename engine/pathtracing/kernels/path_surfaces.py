@@ -63,7 +63,8 @@ from octasplat.engine.pathtracing.kernels.surface import (
     interpolate_uv,
     offset_ray_origin,
 )
-from octasplat.engine.pathtracing.kernels.surface_point_vectors import LANES, write_surface_points8
+from octasplat.engine.pathtracing.kernels.surface_point_vectors import write_surface_points8
+from octasplat.engine.trace.cpu.kernels.simd_vector import LANES
 from octasplat.engine.trace.kernels.native import njit_no_refcount, prefetch
 
 _LAST_WORD = 4 * 8
@@ -71,11 +72,13 @@ _LAST_WORD = 4 * 8
 
 
 @njit_no_refcount(forceinline=True)
-def _sort_hits(scratch: PathScratch, scene: MeshScene, faces: Int32[np.ndarray, " n"], first: int, last: int) -> int:
+def _sort_hits(
+    scratch: PathScratch, scene: MeshScene, faces: Int32[np.ndarray, " n"], first: int, last: int
+) -> int:
     """Write those of the rows ``first`` to ``last``, at most a block, that meet a face, by kind of material.
 
-    One kind after the other, so that neighbors take the same way through the code; returns how many there are.
-    The last row is repeated to fill a vector.
+    One kind after the other: neighbors take the same way through the code. Returns how many there are;
+    behind them the last one is repeated to fill a vector.
     """
     found, kinds, rows = scratch.samples, scratch.faces, scratch.rows  # the first two are free here
     hits = 0
@@ -131,9 +134,7 @@ def _prefetch_face(surfaces: SurfaceArrays, face: int) -> None:
 
 
 @njit_no_refcount(forceinline=True, fastmath={"contract"})
-def _write_denoiser_guides(
-    paths: PathArrays, p: int, albedo: Rgb, normal: Vec3
-) -> None:
+def _write_denoiser_guides(paths: PathArrays, p: int, albedo: Rgb, normal: Vec3) -> None:
     """Write color and normal of the first mesh that the camera's ray hits, weighted by visibility."""
     share = paths.mesh_visibility[p]
     for channel in range(3):
@@ -230,7 +231,8 @@ def _shade_hit(scratch: PathScratch, bounce: Bounce, k: int, n: int, place: int)
     # unsigned: no place is counted from the end of an array
     p, face, at = np.uintp(active[k]), np.uintp(hits.faces[k]), scratch.surface_points
     position = at[0, place], at[1, place], at[2, place]
-    normal, shading_normal = (at[3, place], at[4, place], at[5, place]), (at[6, place], at[7, place], at[8, place])
+    normal = at[3, place], at[4, place], at[5, place]
+    shading_normal = at[6, place], at[7, place], at[8, place]
     facing = at[9, place]
     b, c = float(hits.barycentrics[k, 0]), float(hits.barycentrics[k, 1])
     a = 1.0 - b - c
@@ -294,7 +296,8 @@ def shade_surfaces(first: int, last: int, scratch: PathScratch, bounce: Bounce) 
         # --- rays that meet nothing ---
         for k in range(start, end):
             face = hits.faces[k]
-            shadows.radiance_linear[k, 0] = shadows.radiance_linear[k, 1] = shadows.radiance_linear[k, 2] = 0.0
+            for channel in range(3):
+                shadows.radiance_linear[k, channel] = 0.0
             if face == PATH_ENDED:
                 continue
             p = active[k]

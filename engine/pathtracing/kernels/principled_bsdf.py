@@ -56,12 +56,10 @@ def cos_sin_of_turns(v: float) -> tuple[float, float]:
     quarter = int(4.0 * v + 0.5)
     x = 2.0 * math.pi * (v - 0.25 * quarter)
     x2 = x * x
-    sine = x * (
-        1.0 + x2 * (-1 / 6 + x2 * (1 / 120 + x2 * (-1 / 5040 + x2 * (1 / 362880 - x2 * (1 / 39916800)))))
-    )
-    cosine = 1.0 + x2 * (
-        -1 / 2 + x2 * (1 / 24 + x2 * (-1 / 720 + x2 * (1 / 40320 + x2 * (-1 / 3628800 + x2 * (1 / 479001600)))))
-    )
+    sine = 1 / 362880 - x2 * (1 / 39916800)
+    sine = x * (1.0 + x2 * (-1 / 6 + x2 * (1 / 120 + x2 * (-1 / 5040 + x2 * sine))))
+    cosine = -1 / 3628800 + x2 * (1 / 479001600)
+    cosine = 1.0 + x2 * (-1 / 2 + x2 * (1 / 24 + x2 * (-1 / 720 + x2 * (1 / 40320 + x2 * cosine))))
     # odd quarters swap both
     a, b = (sine, cosine) if quarter & 1 else (cosine, sine)
     return (-a if (quarter + 1) & 2 else a), (-b if quarter & 2 else b)

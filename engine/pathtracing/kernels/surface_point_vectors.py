@@ -81,7 +81,7 @@ def write_surface_points8(
         facing = _dot(d, n) * -1.0
         side = (facing >= 0.0).select(Vector(builder, ir.Constant(DOUBLE8, [1.0] * LANES)), -1.0)
         n = [x * side for x in n]
-        # --- the interpolated normal on the same side; the face's where the viewer would see it from behind ---
+        # --- the interpolated normal on the same side; the face's where the viewer sees that from behind ---
         place, s = (
             [a * rows[j] + b * rows[3 + j] + c * rows[6 + j] for j in range(3)]
             for rows in (corner, corner_normal)

@@ -125,11 +125,11 @@ def closest_hits(
     for k in range(first, last, LANES):
         _query_rays8(query, rays, k, last, scratch)
         for lane in range(min(LANES, last - k)):
-            hit = words[GEOMETRY * LANES + lane] != INVALID_ID
-            out.faces[k + lane] = words[FACE * LANES + lane] if hit else -1
-            out.distances[k + lane] = scratch[T_FAR * LANES + lane] if hit else np.float32(np.inf)
-            out.barycentrics[k + lane, 0] = scratch[U * LANES + lane] if hit else np.float32(0.0)
-            out.barycentrics[k + lane, 1] = scratch[V * LANES + lane] if hit else np.float32(0.0)
+            hit, row = words[GEOMETRY * LANES + lane] != INVALID_ID, np.uintp(k + lane)
+            out.faces[row] = words[FACE * LANES + lane] if hit else -1
+            out.distances[row] = scratch[T_FAR * LANES + lane] if hit else np.float32(np.inf)
+            out.barycentrics[row, 0] = scratch[U * LANES + lane] if hit else np.float32(0.0)
+            out.barycentrics[row, 1] = scratch[V * LANES + lane] if hit else np.float32(0.0)
 
 
 @njit_no_refcount()
