@@ -244,11 +244,11 @@ def _shade_hit(scratch: PathScratch, bounce: Bounce, k: int, n: int, place: int)
         for channel in range(3):
             paths.throughput[p, channel] *= math.exp(-medium[channel] * hits.distances[k])
     is_guide = paths.flags[p] & FLAG_CAMERA_RAY != 0 and paths.mesh_visibility[p] == 0.0
-    goes_on = kind != EMITTER and depth < integrator.max_depth
+    continues = kind != EMITTER and depth < integrator.max_depth
     if is_guide:
         paths.mesh_visibility[p] = paths.transmittance[p]
         # white until the material is known; mirrors and glass stay so
-        if goes_on:
+        if continues:
             _write_denoiser_guides(paths, p, (1.0, 1.0, 1.0), shading_normal)
         else:
             side = 1.0 if facing >= 0.0 else -1.0
@@ -262,7 +262,7 @@ def _shade_hit(scratch: PathScratch, bounce: Bounce, k: int, n: int, place: int)
         u_t, v_t = interpolate_uv(surfaces.corner_uv[face], a, b, c)
         # meshes shine on both sides
         shade_emitter(paths, p, lights, l, hits.distances[k], abs(facing), u_t, v_t, integrator)
-    if not goes_on:
+    if not continues:
         paths.is_alive[p] = False
         return
     # --- the way on ---
