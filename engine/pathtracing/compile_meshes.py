@@ -159,15 +159,20 @@ def compile_meshes(
     is_cutout = (has_holes | (materials.uses_vertex_alpha != 0))[surfaces.material_ids]
     is_filter = is_cutout | (materials.kinds[surfaces.material_ids] == GLASS)
     some = bool(is_filter.any())
+
+    def hierarchy(rows: Int32[np.ndarray, "f 3"]) -> TriangleBvh:
+        # Rays with random numbers meet no edge exactly, those through centres of pixels do.
+        return TriangleBvh(points, rows, threads=threads, is_watertight=not stage.integrator.anti_aliasing)
+
     return CompiledMeshes(
         surfaces=surfaces,
-        triangles=TriangleBvh(points, faces, threads=threads),
+        triangles=hierarchy(faces),
         materials=materials,
         lights=lights,
         environment_visible=stage.environment is not None and stage.environment.visible,
-        covers=TriangleBvh(points, faces[~is_cutout], threads=threads) if is_cutout.any() else None,
-        obstacles=TriangleBvh(points, faces[~is_filter], threads=threads) if some else None,
-        filters=TriangleBvh(points, faces[is_filter], threads=threads) if some else None,
+        covers=hierarchy(faces[~is_cutout]) if is_cutout.any() else None,
+        obstacles=hierarchy(faces[~is_filter]) if some else None,
+        filters=hierarchy(faces[is_filter]) if some else None,
         filter_faces=np.flatnonzero(is_filter) if some else None,
     )
 

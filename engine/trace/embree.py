@@ -187,7 +187,10 @@ class EmbreeBoxScene(_EmbreeScene):
 
 
 class EmbreeTriangleScene(_EmbreeScene):
-    """A hierarchy over triangles, which Embree intersects; the arrays are copied."""
+    """A hierarchy over triangles, which Embree intersects; the arrays are copied.
+
+    Where it ``is_watertight`` no ray slips through between triangles that share an edge.
+    """
 
     def __init__(
         self,
@@ -196,9 +199,11 @@ class EmbreeTriangleScene(_EmbreeScene):
         faces: Int[np.ndarray, "f 3"],
         *,
         quality: int = 1,
+        is_watertight: bool = True,
     ) -> None:
         super().__init__(device, quality)
-        self._lib.rtcSetSceneFlags(self.handle, _SCENE_ROBUST)  # no ray slips through between triangles
+        if is_watertight:
+            self._lib.rtcSetSceneFlags(self.handle, _SCENE_ROBUST)
         # Embree reads 16 bytes at each vertex, past the end of the last one.
         self._vertices = np.zeros((len(vertices_world) + 1, 3), np.float32)
         self._vertices[:-1] = vertices_world

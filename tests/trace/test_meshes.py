@@ -12,9 +12,10 @@ QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (
 CUBE_FACES = np.array([face for a, b, c, d in QUADS for face in ((a, b, c), (a, c, d))])
 
 
-@pytest.fixture(params=[1, 2])
+@pytest.fixture(params=[(1, True), (2, True), (1, False)])
 def cube(request: pytest.FixtureRequest) -> TriangleBvh:
-    return TriangleBvh(CUBE_CORNERS, CUBE_FACES, threads=request.param)
+    threads, is_watertight = request.param
+    return TriangleBvh(CUBE_CORNERS, CUBE_FACES, threads=threads, is_watertight=is_watertight)
 
 
 def test_rays_from_the_middle_of_a_cube(cube: TriangleBvh, rng: np.random.Generator) -> None:

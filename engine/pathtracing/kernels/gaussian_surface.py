@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from octasplat.engine.core.compilation import kernel
-from octasplat.engine.pathtracing.kernels.camera_paths import reset_path
+from octasplat.engine.pathtracing.kernels.camera_paths import reset_paths
 from octasplat.engine.pathtracing.kernels.gaussian_layer import MIN_COVERAGE
 from octasplat.engine.pathtracing.kernels.kernel_args import (
     AlbedoTables,
@@ -171,6 +171,7 @@ def start_paths_at_surfaces(
     """Start paths at points of surfaces, as if the camera's rays had hit them there."""
     column = PathSamples(scratch.random_numbers, 0)
     tables = _albedo_tables(materials)
+    reset_paths(paths, first, last - first, FLAG_GAUSSIAN_SURFACE)
     for k in range(first, last):
         paths.keys[k], paths.samples[k] = pixel_key(integrator.seed, pixels[k]), samples[k]
         shadows.radiance_linear[k, 0] = shadows.radiance_linear[k, 1] = shadows.radiance_linear[k, 2] = 0.0
@@ -180,8 +181,8 @@ def start_paths_at_surfaces(
             interactions.normals_world[k],
         )
         origin = float(point[0]), float(point[1]), float(point[2])
-        # as if the camera had met it
-        reset_path(paths, k, origin, (float(d[0]), float(d[1]), float(d[2])), FLAG_GAUSSIAN_SURFACE)
+        for axis in range(3):
+            paths.origins_world[k, axis], paths.directions_world[k, axis] = point[axis], d[axis]
         _draw_samples(paths, k, FIRST_PAIR + 1, scratch.random_numbers)
         material = interactions.materials[k]
         normal = float(n[0]), float(n[1]), float(n[2])

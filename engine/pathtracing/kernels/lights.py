@@ -96,7 +96,9 @@ def sample_light_index(
     """
     count = len(lights.kinds)
     if count == 1:
-        return (0, 1.0) if _light_weight(lights, 0, p_x, p_y, p_z, is_mesh) > 0.0 else (-1, 0.0)
+        # where a light does not shine its sample brings nothing to a mesh
+        shines = lights.lights_meshes[0] != 0 if is_mesh else light_importance(lights, 0, p_x, p_y, p_z) > 0.0
+        return (0, 1.0) if shines else (-1, 0.0)
     total = 0.0
     for l in range(count):
         total += _light_weight(lights, l, p_x, p_y, p_z, is_mesh)
@@ -116,6 +118,8 @@ def sample_light_index(
 @njit_no_refcount(forceinline=True, fastmath={"contract"})
 def light_probability(lights: LightArrays, light_id: int, p_x: float, p_y: float, p_z: float) -> float:
     """Return the probability with which :func:`sample_light_index` asks a light at p, on a mesh."""
+    if len(lights.kinds) == 1:
+        return 1.0 if lights.lights_meshes[0] else 0.0
     total, own = 0.0, 0.0
     for l in range(len(lights.kinds)):
         weight = _light_weight(lights, l, p_x, p_y, p_z, True)
@@ -285,14 +289,14 @@ def sample_light(
         way_y += a * lights.sides_u[l, 1] + b * lights.sides_v[l, 1]
         way_z += a * lights.sides_u[l, 2] + b * lights.sides_v[l, 2]
     squared = max(way_x * way_x + way_y * way_y + way_z * way_z, 1e-20)
+    along = -(axis[0] * way_x + axis[1] * way_y + axis[2] * way_z)  # distance times cosine at a rectangle
     distance = math.sqrt(squared)
     inverse = 1.0 / distance
     way_x, way_y, way_z = inverse * way_x, inverse * way_y, inverse * way_z
     if kind == RECTANGLE:
-        cosine = -(axis[0] * way_x + axis[1] * way_y + axis[2] * way_z)
-        if cosine <= 1e-9:
+        if along <= 1e-9 * distance:
             return way_x, way_y, way_z, distance, 0.0, 0.0, 0.0, 1.0
-        pdf = squared / (cosine * lights.areas[l])
+        pdf = squared * distance / (along * lights.areas[l])
         return way_x, way_y, way_z, distance, rgb[0], rgb[1], rgb[2], pdf
     falloff = 1.0 / squared
     if kind == SPOT:

@@ -21,6 +21,7 @@ from octasplat.engine.pathtracing.kernels.kernel_args import (
     AlbedoTables,
     Bsdf,
     MeshScene,
+    Rgb,
     SurfaceArrays,
     SurfacePoint,
     Vec3,
@@ -31,6 +32,7 @@ from octasplat.engine.pathtracing.kernels.path_args import (
     CAMERA_SAMPLE_PAIRS,
     PATH_ENDED,
     SAMPLE_PAIRS_PER_BOUNCE,
+    SHADING_ROWS,
     Bounce,
     LightQuery,
     PathArrays,
@@ -57,42 +59,61 @@ from octasplat.engine.pathtracing.kernels.surface import (
     eval_material,
     eval_normal_map,
     eval_vertex_color,
-    face_normal,
     has_textures,
-    interpolate_corners,
     interpolate_uv,
     offset_ray_origin,
-    shading_normal,
 )
+from octasplat.engine.pathtracing.kernels.surface_point_vectors import write_surface_points8
+from octasplat.engine.trace.cpu.kernels.simd_vector import LANES
 from octasplat.engine.trace.kernels.native import njit_no_refcount, prefetch
 
-PREFETCH_ROWS = 16
-"""How far ahead of their use the rows of faces are asked for."""
 _LAST_WORD = 4 * 8
 """Bytes before the last number of three corners."""
 
 
-@njit_no_refcount(forceinline=True, fastmath={"contract"})
+@njit_no_refcount(forceinline=True)
+def _sort_hits(
+    scratch: PathScratch, scene: MeshScene, faces: Int32[np.ndarray, " n"], first: int, last: int
+) -> int:
+    """Write those of the rows ``first`` to ``last``, at most a block, that meet a face, by kind of material.
+
+    One kind after the other: neighbors take the same way through the code. Returns how many there are;
+    behind them the last one is repeated to fill a vector.
+    """
+    found, kinds, rows = scratch.samples, scratch.faces, scratch.rows  # the first two are free here
+    hits = 0
+    for k in range(first, last):
+        found[hits] = k
+        hits += faces[k] >= 0
+    for i in range(hits):
+        kinds[i] = scene.materials.kinds[scene.surfaces.material_ids[faces[found[i]]]]
+    count = 0
+    for kind in range(EMITTER + 1):
+        # no branch: which kind comes next is not to be foreseen
+        for i in range(hits):
+            rows[count] = found[i]
+            count += kinds[i] == kind
+    for i in range(count, count + LANES - 1):
+        rows[i] = rows[count - 1]
+    return count
+
+
+@njit_no_refcount(forceinline=True)
 def _fill_samples(
     scratch: PathScratch,
     paths: PathArrays,
     active: Int32[np.ndarray, " n"],
-    faces: Int32[np.ndarray, " n"],
-    first: int,
-    last: int,
+    count: int,
     first_pair: int,
     light_count: int,
 ) -> None:
-    """Fill in the numbers of those of the rows ``first`` to ``last``, at most a block, that meet a face.
+    """Fill in the numbers of the ``count`` rows of :func:`_sort_hits`, in their order.
 
     Where there is no choice of lights there are no numbers for it.
     """
-    count = 0
-    for k in range(first, last):
-        if faces[k] >= 0:
-            p = active[k]
-            scratch.keys[count], scratch.samples[count] = paths.keys[p], paths.samples[p]
-            count += 1
+    for i in range(count):
+        p = active[scratch.rows[i]]
+        scratch.keys[i], scratch.samples[i] = paths.keys[p], paths.samples[p]
     for pair in range(len(scratch.random_numbers)):
         if pair != LIGHT_CHOICE_SAMPLE or light_count > 1:
             fill_pair(
@@ -113,17 +134,12 @@ def _prefetch_face(surfaces: SurfaceArrays, face: int) -> None:
 
 
 @njit_no_refcount(forceinline=True, fastmath={"contract"})
-def _write_denoiser_guides(
-    paths: PathArrays, p: int, red: float, green: float, blue: float, n_x: float, n_y: float, n_z: float
-) -> None:
+def _write_denoiser_guides(paths: PathArrays, p: int, albedo: Rgb, normal: Vec3) -> None:
     """Write color and normal of the first mesh that the camera's ray hits, weighted by visibility."""
     share = paths.mesh_visibility[p]
-    paths.albedo_linear[p, 0] = share * red
-    paths.albedo_linear[p, 1] = share * green
-    paths.albedo_linear[p, 2] = share * blue
-    paths.normals_world[p, 0] = share * n_x
-    paths.normals_world[p, 1] = share * n_y
-    paths.normals_world[p, 2] = share * n_z
+    for channel in range(3):
+        paths.albedo_linear[p, channel] = share * albedo[channel]
+        paths.normals_world[p, channel] = share * normal[channel]
 
 
 @njit_no_refcount(forceinline=True, fastmath={"contract"})
@@ -173,7 +189,7 @@ def _scatter_at_material(
         (float(d[0]), float(d[1]), float(d[2])),
     )  # fmt: skip
     if is_guide:
-        _write_denoiser_guides(paths, p, red, green, blue, s_x, s_y, s_z)
+        _write_denoiser_guides(paths, p, (red, green, blue), (s_x, s_y, s_z))
     table = materials.coat_tables[m]
     coat, coat_roughness = eval_clear_coat(materials, m, u_t, v_t)
     bsdf = Bsdf(
@@ -189,6 +205,82 @@ def _scatter_at_material(
     scatter_path(p, samples, paths, kind == DIFFUSE, off_surface, bsdf, tables, query)
 
 
+@njit_no_refcount(forceinline=True)
+def _write_surface_points(scratch: PathScratch, first: int, last: int, bounce: Bounce) -> None:
+    """Write what the shading of the rows at the places ``first`` to ``last`` of the sorted ones begins with.
+
+    Nothing here depends on materials.
+    """
+    surfaces, points = bounce.scene.surfaces, scratch.surface_points
+    row_bytes = points.shape[1] * points.itemsize
+    for i in range(first, last, LANES):
+        write_surface_points8(
+            scratch.rows.ctypes.data + i * scratch.rows.itemsize,
+            bounce.active.ctypes.data, bounce.hits.faces.ctypes.data, bounce.hits.barycentrics.ctypes.data,
+            bounce.paths.directions_world.ctypes.data,
+            surfaces.corners_world.ctypes.data, surfaces.corner_normals.ctypes.data,
+            points.ctypes.data + (i - first) * points.itemsize, row_bytes,
+        )  # fmt: skip
+
+
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
+def _shade_hit(scratch: PathScratch, bounce: Bounce, k: int, n: int, place: int) -> None:
+    """Shade row ``k`` with the random numbers ``n``; its surface point is that at ``place``."""
+    paths, active, depth, hits, scene, integrator, shadows = bounce
+    surfaces, materials, lights = scene.surfaces, scene.materials, scene.lights
+    # unsigned: no place is counted from the end of an array
+    p, face, at = np.uintp(active[k]), np.uintp(hits.faces[k]), scratch.surface_points
+    position = at[0, place], at[1, place], at[2, place]
+    normal = at[3, place], at[4, place], at[5, place]
+    shading_normal = at[6, place], at[7, place], at[8, place]
+    facing = at[9, place]
+    b, c = float(hits.barycentrics[k, 0]), float(hits.barycentrics[k, 1])
+    a = 1.0 - b - c
+    m = surfaces.material_ids[face]
+    kind = materials.kinds[m]
+    # Beer's law, on the way inside of glass up to this hit
+    if paths.medium_ids[p] >= 0:
+        medium = materials.absorption[paths.medium_ids[p]]
+        for channel in range(3):
+            paths.throughput[p, channel] *= math.exp(-medium[channel] * hits.distances[k])
+    is_guide = paths.flags[p] & FLAG_CAMERA_RAY != 0 and paths.mesh_visibility[p] == 0.0
+    continues = kind != EMITTER and depth < integrator.max_depth
+    if is_guide:
+        paths.mesh_visibility[p] = paths.transmittance[p]
+        # white until the material is known; mirrors and glass stay so
+        if continues:
+            _write_denoiser_guides(paths, p, (1.0, 1.0, 1.0), shading_normal)
+        else:
+            side = 1.0 if facing >= 0.0 else -1.0
+            n_x, n_y, n_z = normal
+            _write_denoiser_guides(paths, p, (1.0, 1.0, 1.0), (side * n_x, side * n_y, side * n_z))
+    # --- light that the surface sends by itself ---
+    l = materials.light_ids[m]
+    if kind == EMITTER:
+        shade_emitter(paths, p, lights, l, hits.distances[k], facing, 0.0, 0.0, integrator)
+    elif l >= 0:
+        u_t, v_t = interpolate_uv(surfaces.corner_uv[face], a, b, c)
+        # meshes shine on both sides
+        shade_emitter(paths, p, lights, l, hits.distances[k], abs(facing), u_t, v_t, integrator)
+    if not continues:
+        paths.is_alive[p] = False
+        return
+    # --- the way on ---
+    samples = PathSamples(scratch.random_numbers, n)
+    if depth >= integrator.roulette_depth and not survives_roulette(
+        paths, p, sample_pair(samples, LOBE_SAMPLE)[1]
+    ):
+        return
+    query = LightQuery(lights, integrator, shadows, k)
+    shadows.medium_ids[k] = paths.medium_ids[p]
+    if scene.any_nested:
+        copy_media(paths.media[p], shadows.media[k])
+    point = SurfacePoint(position, normal, shading_normal)
+    _scatter_at_material(
+        paths, p, scene, face, (a, b, c), facing >= 0.0, point, is_guide, samples, query
+    )  # fmt: skip
+
+
 @kernel(_nrt=False, error_model="numpy", fastmath={"contract"})
 def shade_surfaces(first: int, last: int, scratch: PathScratch, bounce: Bounce) -> None:
     """Shade what paths find at the end of their rays.
@@ -197,78 +289,31 @@ def shade_surfaces(first: int, last: int, scratch: PathScratch, bounce: Bounce) 
     the shadow rays. Paths that end are not alive any more.
     """
     paths, active, depth, hits, scene, integrator, shadows = bounce
-    surfaces, materials, lights = scene.surfaces, scene.materials, scene.lights
+    surfaces, lights = scene.surfaces, scene.lights
     first_pair = CAMERA_SAMPLE_PAIRS + depth * SAMPLE_PAIRS_PER_BOUNCE
-    n = 0
-    for k in range(first, last):
-        if (k - first) % BLOCK_SIZE == 0:
-            end = min(k + BLOCK_SIZE, last)
-            _fill_samples(scratch, paths, active, hits.faces, k, end, first_pair, len(lights.kinds))
-            n = -1
-        if k + PREFETCH_ROWS < last:
-            _prefetch_face(surfaces, hits.faces[k + PREFETCH_ROWS])
-        p, face = active[k], hits.faces[k]
-        shadows.radiance_linear[k, 0] = shadows.radiance_linear[k, 1] = shadows.radiance_linear[k, 2] = 0.0
-        if face == PATH_ENDED:
-            continue
-        # what lies behind a passed surface of glass is found by this path alone: it shadows light queries
-        if scene.any_nested and copy_media(hits.media[k], paths.media[p]):
-            paths.pdf[p] = 0.0
-        # --- nothing was met ---
-        if face < 0:
-            shade_miss(paths, p, lights, scene.environment, integrator)
-            paths.is_alive[p] = False
-            continue
-        n += 1
-        # --- the point: weights a, b, c of the corners, the face's normal, the medium up to there ---
-        d = paths.directions_world[p]
-        b, c = float(hits.barycentrics[k, 0]), float(hits.barycentrics[k, 1])
-        a = 1.0 - b - c
-        n_x, n_y, n_z = face_normal(surfaces.corners_world[face])
-        facing = -(d[0] * n_x + d[1] * n_y + d[2] * n_z)
-        m = surfaces.material_ids[face]
-        kind = materials.kinds[m]
-        # Beer's law, on the way inside of glass up to this hit
-        if paths.medium_ids[p] >= 0:
-            medium = materials.absorption[paths.medium_ids[p]]
+    for start in range(first, last, BLOCK_SIZE):
+        end = min(start + BLOCK_SIZE, last)
+        # --- rays that meet nothing ---
+        for k in range(start, end):
+            face = hits.faces[k]
             for channel in range(3):
-                paths.throughput[p, channel] *= math.exp(-medium[channel] * hits.distances[k])
-        is_guide = paths.flags[p] & FLAG_CAMERA_RAY != 0 and paths.mesh_visibility[p] == 0.0
-        if is_guide:
-            paths.mesh_visibility[p] = paths.transmittance[p]
-            # white until the material is known; mirrors and glass stay so
-            _write_denoiser_guides(paths, p, 1.0, 1.0, 1.0, n_x, n_y, n_z)
-        # --- light that the surface sends by itself ---
-        l = materials.light_ids[m]
-        if kind == EMITTER:
-            shade_emitter(paths, p, lights, l, hits.distances[k], facing, 0.0, 0.0, integrator)
-        elif l >= 0:
-            u_t, v_t = interpolate_uv(surfaces.corner_uv[face], a, b, c)
-            # meshes shine on both sides
-            shade_emitter(paths, p, lights, l, hits.distances[k], abs(facing), u_t, v_t, integrator)
-        if kind == EMITTER or depth >= integrator.max_depth:
-            paths.is_alive[p] = False
-            continue
-        # --- the way on ---
-        point = interpolate_corners(surfaces.corners_world[face], a, b, c)
-        # from here on the normal is on the viewer's side
-        if facing < 0.0:
-            n_x, n_y, n_z = -n_x, -n_y, -n_z
-        s_x, s_y, s_z = shading_normal(
-            surfaces.corner_normals[face], a, b, c, n_x, n_y, n_z, d[0], d[1], d[2]
-        )
-        if is_guide:
-            _write_denoiser_guides(paths, p, 1.0, 1.0, 1.0, s_x, s_y, s_z)
-        samples = PathSamples(scratch.random_numbers, n)
-        if depth >= integrator.roulette_depth and not survives_roulette(
-            paths, p, sample_pair(samples, LOBE_SAMPLE)[1]
-        ):
-            continue
-        query = LightQuery(lights, integrator, shadows, k)
-        shadows.medium_ids[k] = paths.medium_ids[p]
-        if scene.any_nested:
-            copy_media(paths.media[p], shadows.media[k])
-        _scatter_at_material(
-            paths, p, scene, face, (a, b, c), facing >= 0.0,
-            SurfacePoint(point, (n_x, n_y, n_z), (s_x, s_y, s_z)), is_guide, samples, query,
-        )  # fmt: skip
+                shadows.radiance_linear[k, channel] = 0.0
+            if face == PATH_ENDED:
+                continue
+            p = active[k]
+            # what lies behind a passed surface of glass is found by this path alone: it shadows light queries
+            if scene.any_nested and copy_media(hits.media[k], paths.media[p]):
+                paths.pdf[p] = 0.0
+            if face < 0:
+                shade_miss(paths, p, lights, scene.environment, integrator)
+                paths.is_alive[p] = False
+        # --- rays that meet a face, a kind of material after the other ---
+        count = _sort_hits(scratch, scene, hits.faces, start, end)
+        _fill_samples(scratch, paths, active, count, first_pair, len(lights.kinds))
+        for begin in range(0, count, SHADING_ROWS):
+            stop = min(begin + SHADING_ROWS, count)
+            for i in range(begin, stop):
+                _prefetch_face(surfaces, hits.faces[scratch.rows[i]])
+            _write_surface_points(scratch, begin, stop, bounce)
+            for i in range(begin, stop):
+                _shade_hit(scratch, bounce, np.uintp(scratch.rows[i]), i, i - begin)

@@ -48,10 +48,29 @@ def fresnel_dielectric(cos_o: float, eta: float) -> tuple[float, float]:
 
 
 @njit_no_refcount(forceinline=True, fastmath={"contract"})
+def cos_sin_of_turns(v: float) -> tuple[float, float]:
+    """Return cosine and sine of 2 pi v, for v from 0 to 1, to 1e-10.
+
+    Taylor's series about the nearest quarter of a turn: no call and no branch, so that several go on at once.
+    """
+    quarter = int(4.0 * v + 0.5)
+    x = 2.0 * math.pi * (v - 0.25 * quarter)
+    x2 = x * x
+    sine = 1 / 362880 - x2 * (1 / 39916800)
+    sine = x * (1.0 + x2 * (-1 / 6 + x2 * (1 / 120 + x2 * (-1 / 5040 + x2 * sine))))
+    cosine = -1 / 3628800 + x2 * (1 / 479001600)
+    cosine = 1.0 + x2 * (-1 / 2 + x2 * (1 / 24 + x2 * (-1 / 720 + x2 * (1 / 40320 + x2 * cosine))))
+    # odd quarters swap both
+    a, b = (sine, cosine) if quarter & 1 else (cosine, sine)
+    return (-a if (quarter + 1) & 2 else a), (-b if quarter & 2 else b)
+
+
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def sample_cosine(u: float, v: float) -> tuple[float, float, float]:
     """Return a direction over the hemisphere, as dense as its cosine; its density is cosine / pi."""
-    radius, angle = math.sqrt(u), 2.0 * math.pi * v
-    return radius * math.cos(angle), radius * math.sin(angle), math.sqrt(max(1.0 - u, 0.0))
+    radius = math.sqrt(u)
+    cosine, sine = cos_sin_of_turns(v)
+    return radius * cosine, radius * sine, math.sqrt(max(1.0 - u, 0.0))
 
 
 @njit_no_refcount(forceinline=True, fastmath={"contract"})

@@ -38,9 +38,12 @@ from octasplat.engine.trace.kernels.triangles import (
 @njit_no_refcount(forceinline=True)
 def _select_shadow_rays(
     shadows: ShadowRayArrays, first: int, last: int, passes_glass: bool, rows: Int32[np.ndarray, " b"]
-) -> int:
-    """Return the rows of shadow rays that bring anything, the straight ones or the others, and how many."""
-    count = 0
+) -> tuple[int, int]:
+    """Write the rows of shadow rays that bring anything, the straight ones or those that pass glass.
+
+    Returns how many they are, and how many are of the other sort.
+    """
+    count = others = 0
     for k in range(first, last):
         brings = (
             shadows.radiance_linear[k, 0] + shadows.radiance_linear[k, 1] + shadows.radiance_linear[k, 2]
@@ -52,10 +55,12 @@ def _select_shadow_rays(
             + shadows.occluded_radiance_linear[k, 2]
             < 0.0
         )
-        if (brings or takes) and shadows.passes_glass[k] == passes_glass:
+        if brings or takes:
             rows[count] = k
-            count += 1
-    return count
+            is_wanted = shadows.passes_glass[k] == passes_glass
+            count += is_wanted
+            others += not is_wanted
+    return count, others
 
 
 @njit_no_refcount(forceinline=True)
@@ -252,7 +257,7 @@ def shadow_transmittance(
         end = min(start + BLOCK_SIZE, last)
         for k in range(start, end):
             transmittance[k, 0] = transmittance[k, 1] = transmittance[k, 2] = 0.0
-        count = _select_shadow_rays(shadows, start, end, False, scratch.rows)
+        count, others = _select_shadow_rays(shadows, start, end, False, scratch.rows)
         count = _trace_occlusion(queries.any_hit, shadows, scratch, count, transmittance)
         if queries.any_cutout:
             _trace_filters(
@@ -260,7 +265,9 @@ def shadow_transmittance(
             )  # fmt: skip
         else:
             _attenuate_at_start(materials, shadows, scratch, count, transmittance)
-        count = _select_shadow_rays(shadows, start, end, True, scratch.rows)
+        if others == 0:
+            continue
+        count, _ = _select_shadow_rays(shadows, start, end, True, scratch.rows)
         count = _trace_occlusion(queries.any_hit_opaque, shadows, scratch, count, transmittance)
         if queries.closest_hit_filter.scene != 0:
             _trace_filters(

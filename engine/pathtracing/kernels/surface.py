@@ -201,29 +201,6 @@ def eval_normal_map(
 
 
 @njit_no_refcount(forceinline=True, fastmath={"contract"})
-def shading_normal(
-    normals: Float32[np.ndarray, "3 3"],
-    a: float,
-    b: float,
-    c: float,
-    n_x: float,
-    n_y: float,
-    n_z: float,
-    d_x: float,
-    d_y: float,
-    d_z: float,
-) -> tuple[float, float, float]:
-    """Return the interpolated normal on the side of n; n itself where the viewer would see it from behind."""
-    s_x, s_y, s_z = interpolate_corners(normals, a, b, c)
-    s_x, s_y, s_z = normalize(s_x, s_y, s_z)
-    if s_x * n_x + s_y * n_y + s_z * n_z < 0.0:
-        s_x, s_y, s_z = -s_x, -s_y, -s_z
-    if s_x * d_x + s_y * d_y + s_z * d_z > -1e-4:
-        return n_x, n_y, n_z
-    return s_x, s_y, s_z
-
-
-@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def reflect(
     d_x: float, d_y: float, d_z: float, n_x: float, n_y: float, n_z: float
 ) -> tuple[float, float, float]:

@@ -169,6 +169,21 @@ def prefetch(typingctx: TypingContext, address: Address) -> Intrinsic:
     return signature, codegen
 
 
+@intrinsic
+def fill_bytes(typingctx: TypingContext, address: Address, size: int, value: int) -> Intrinsic:
+    """Set ``size`` bytes from ``address`` on to ``value``."""
+    signature = types.void(types.uintp, types.int64, types.int64)
+
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
+        pointer = builder.inttoptr(args[0], ir.IntType(8).as_pointer())
+        cgutils.memset(builder, pointer, args[1], builder.trunc(args[2], ir.IntType(8)))
+        return context.get_dummy_value()
+
+    return signature, codegen
+
+
 @njit_no_refcount(forceinline=True)
 def prefetch_bytes(address: int, size: int) -> None:
     """Run :func:`prefetch` for all cache lines of so many bytes."""

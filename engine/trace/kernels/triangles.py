@@ -78,21 +78,27 @@ def _query_rays8(
 ) -> None:
     """Trace up to eight rays, from ``row`` on and before ``end``, after :func:`_prepare_queries`."""
     words = scratch.view(np.int32)
+    # a single origin or limit stands for all rays
+    each_origin = 1 if len(rays.origins) > 1 else 0
+    each_near, each_far = 1 if len(rays.t_min) > 1 else 0, 1 if len(rays.t_max) > 1 else 0
+    is_indirect = len(rays.ray_indices) > 0
     # --- the rays, a lane each ---
     for lane in range(LANES):
         lane_row = min(row + lane, end - 1)  # lanes beyond the end repeat the last ray, but are not valid
-        r = rays.ray_indices[lane_row] if len(rays.ray_indices) else lane_row
-        o = r if len(rays.origins) > 1 else 0
-        for axis in range(3):
-            scratch[(ORIGIN + axis) * LANES + lane] = rays.origins[o, axis]
-            scratch[(DIRECTION + axis) * LANES + lane] = rays.directions[r, axis]
-        near = rays.t_min[r if len(rays.t_min) > 1 else 0]
-        far = rays.t_max[r if len(rays.t_max) > 1 else 0]
+        # unsigned: no place is counted from the end of an array
+        r = np.uintp(rays.ray_indices[np.uintp(lane_row)]) if is_indirect else np.uintp(lane_row)
+        origin, direction = rays.origins[r * np.uintp(each_origin)], rays.directions[r]
+        near, far = rays.t_min[r * np.uintp(each_near)], rays.t_max[r * np.uintp(each_far)]
+        scratch[ORIGIN * LANES + lane] = origin[0]
+        scratch[(ORIGIN + 1) * LANES + lane] = origin[1]
+        scratch[(ORIGIN + 2) * LANES + lane] = origin[2]
+        scratch[DIRECTION * LANES + lane] = direction[0]
+        scratch[(DIRECTION + 1) * LANES + lane] = direction[1]
+        scratch[(DIRECTION + 2) * LANES + lane] = direction[2]
         scratch[T_NEAR * LANES + lane] = near
         scratch[T_FAR * LANES + lane] = far
         words[VALID * LANES + lane] = -1 if row + lane < end and near <= far else 0
-    for lane in range(LANES):  # only a hit has a face and an instance
-        words[GEOMETRY * LANES + lane] = INVALID_ID
+        words[GEOMETRY * LANES + lane] = INVALID_ID  # only a hit has a face and an instance
     address = scratch.ctypes.data
     call_with_four_pointers(
         query.function, address + 4 * VALID * LANES, query.scene, address, address + 4 * ARGUMENTS * LANES
@@ -119,11 +125,11 @@ def closest_hits(
     for k in range(first, last, LANES):
         _query_rays8(query, rays, k, last, scratch)
         for lane in range(min(LANES, last - k)):
-            hit = words[GEOMETRY * LANES + lane] != INVALID_ID
-            out.faces[k + lane] = words[FACE * LANES + lane] if hit else -1
-            out.distances[k + lane] = scratch[T_FAR * LANES + lane] if hit else np.float32(np.inf)
-            out.barycentrics[k + lane, 0] = scratch[U * LANES + lane] if hit else np.float32(0.0)
-            out.barycentrics[k + lane, 1] = scratch[V * LANES + lane] if hit else np.float32(0.0)
+            hit, row = words[GEOMETRY * LANES + lane] != INVALID_ID, np.uintp(k + lane)
+            out.faces[row] = words[FACE * LANES + lane] if hit else -1
+            out.distances[row] = scratch[T_FAR * LANES + lane] if hit else np.float32(np.inf)
+            out.barycentrics[row, 0] = scratch[U * LANES + lane] if hit else np.float32(0.0)
+            out.barycentrics[row, 1] = scratch[V * LANES + lane] if hit else np.float32(0.0)
 
 
 @njit_no_refcount()
