@@ -154,6 +154,7 @@ def train_block(work: BlockWork, plan: ScenePlan, number: int, tell: PieceProgre
         return state
 
     data = BlockDataset(work.dataset, block.pixels)
+    work.dataset.read_ahead(data.train_indices)
     around = scene.select(~is_trained)
     train_piece(work, Piece(name, data, config, start, around), tell.of_piece(name))
 

@@ -386,6 +386,13 @@ class Dataset:
         y = inside // width
         return view, y, inside - y * width
 
+    def read_ahead(self, views: Int64[np.ndarray, " n"]) -> None:
+        """Read the pixels of views that are needed next, if they take less than half of the memory."""
+        starts, ends = self._cache.offsets[:-1][views], self._cache.offsets[1:][views]
+        ranges = np.stack([starts, ends], axis=1)
+        for mapped, channels in ((self._cache.rgb, 3), (self._cache.alpha, 1), (self._cache.mask, 1)):
+            mapped.read_ahead(channels * ranges)
+
     def release_pages(self) -> None:
         """Release mapped pages to the system, e.g. before a stage that needs the memory."""
         for mapped in (self._cache.rgb, self._cache.alpha, self._cache.mask):

@@ -1,3 +1,4 @@
+import mmap
 import os
 import subprocess
 import sys
@@ -10,7 +11,8 @@ import pytest
 
 import octasplat
 from octasplat.engine.core.errors import DatasetError, OutputError
-from octasplat.engine.dataset import Dataset
+from octasplat.engine.dataset import Dataset, mapped_array
+from octasplat.engine.dataset.mapped_array import MappedArray
 
 
 def stamps(folder: Path) -> dict[str, int]:
@@ -38,6 +40,25 @@ def test_dataset_cache_is_reused(tmp_path, make_scene, save_image):
     assert data.pixels(np.array([3]), np.array([7]), np.array([9]))[0].tolist() == [
         np.float32([9 / 255, 7 / 255, 3 / 255]).tolist()
     ]
+
+
+def test_dataset_pixels_are_the_same_when_read_ahead(tmp_path, make_scene, monkeypatch):
+    asked: list[tuple[int, int]] = []
+
+    class Map(mmap.mmap):
+        def madvise(self, _advice: int, start: int = 0, length: int = 0) -> None:
+            asked.append((start, length))
+
+    data = Dataset.open(make_scene(tmp_path / "scene", cameras=[opaque_fisheye()]), tmp_path / "cache")
+    before = data.pixels(np.array([3]), np.array([7]), np.array([9]))[0]
+    data.read_ahead(np.array([0, 3]))
+    assert np.array_equal(before, data.pixels(np.array([3]), np.array([7]), np.array([9]))[0])
+    plane = MappedArray(np.zeros(10_000, np.uint16), Map(-1, 20_000))
+    plane.read_ahead(np.array([[10, 20], [5000, 6000]]))
+    assert asked == [(0, 40), (8192, 12_000 - 8192)]  # whole pages from the first on
+    monkeypatch.setattr(mapped_array, "_read_ahead_bytes", lambda: 3000)
+    plane.read_ahead(np.array([[10, 20], [5000, 6000]]))
+    assert len(asked) == 2
 
 
 def test_dataset_cache_changed_photograph_invalidates(tmp_path, make_scene, save_image):
