@@ -12,11 +12,10 @@ of the work, for two processes.
 
 import argparse
 import io
-import os
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Int16, UInt8
 from PIL import Image
 
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, synthetic_views
@@ -56,7 +55,7 @@ def _dms(degrees: float) -> tuple[float, float, float]:
     return float(whole), float(int(rest)), (rest - int(rest)) * 60
 
 
-def enlarge(pixels: UInt8[np.ndarray, "h w 3"], grain: UInt8[np.ndarray, "H W"]) -> Image.Image:
+def enlarge(pixels: UInt8[np.ndarray, "h w 3"], grain: Int16[np.ndarray, "H W"]) -> Image.Image:
     """Return a photograph at full size with grain."""
     large = np.asarray(Image.fromarray(pixels).resize(SIZE_PX, Image.Resampling.BICUBIC), np.int16)
     return Image.fromarray(np.clip(large + grain[:, :, None], 0, 255).astype(np.uint8))
@@ -114,5 +113,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
     main()
