@@ -28,7 +28,7 @@ _MAP_CPU_SECONDS_PER_PHOTOGRAPH = 0.2
 _LARGE_FEATURES_CPU_SECONDS_PER_PIXEL = 5.0e-7
 _LARGE_MATCH_CPU_SECONDS_PER_PAIR = 0.077
 _LARGE_MAP_CPU_SECONDS_PER_PHOTOGRAPH = 1.1
-"""The same in captures of more photographs than ``quick_look_up_to``, measured with 2,000 of 12 megapixels."""
+"""The same in captures of more photographs than ``quick_look_up_to``, measured with 2,000 of 12 MP."""
 _READ_CPU_SECONDS_PER_PIXEL = 2.0e-8
 """To read photographs to their ends, and once more by COLMAP."""
 _DECODE_CPU_SECONDS_PER_PIXEL = 1.2e-8

@@ -172,7 +172,6 @@ class PoseSearch:
             self._progress(PhaseProgress(MATCHES, settled, total, work_done=work_done))
 
         with phase(MATCHES, self._progress, total):
-            pairs = [] if look_share else all_pairs(count)
             if look_share:
                 pairs = preselect_pairs(
                     database,
@@ -181,6 +180,8 @@ class PoseSearch:
                     threads=self._threads,
                     on_look=lambda unlike, looked: tell(unlike, look_share * looked),
                 )
+            else:
+                pairs = all_pairs(count)
             unlike, wanted = total - len(pairs), max(len(pairs), 1)
             match_pairs(
                 database,
