@@ -5,7 +5,7 @@
 Writes ``FOLDER/gps/images/IMG_0000.jpg`` and on, photographs of the generated street
 (``octasplat.engine.dataset.synthetic``) of 4000 x 3000 pixels with GPS in their EXIF, off by a meter
 (standard deviation), and the same photographs without GPS in ``FOLDER/no_gps``. They are rendered at
-1200 x 900 pixels, enlarged, and get grain, so that the files are as large as a camera's. The true poses are
+1000 x 750 pixels, enlarged, and get grain, so that the files are as large as a camera's. The true poses are
 in ``FOLDER/truth``. What is there already is kept. ``--share 0/2`` and ``--share 1/2`` are the two halves
 of the work, for two processes.
 """
@@ -25,7 +25,7 @@ from octasplat.engine.dataset.synthetic.points import sample_surface_points
 from octasplat.engine.dataset.synthetic.write import cached_lit_scene
 
 SIZE_PX = (4000, 3000)
-RENDERED_PX = (1200, 900)
+RENDERED_PX = (1000, 750)
 QUALITY = 90
 GRAIN = 2.5
 """Standard deviation of the grain, in steps of 8 bits."""

@@ -39,6 +39,7 @@ from octasplat.engine.dataset.synthetic.street_albedo import (
     WINDOW_STEP,
     facade,
     leaves,
+    painted,
     roof_tiles,
     street_ground,
 )
@@ -49,7 +50,7 @@ FACADE_Y = 9.0
 _WIDTH, _DEPTH = 5 * WINDOW_STEP, 4 * WINDOW_STEP
 _CELL = 0.35
 _ALIKE_UP_TO = 8
-"""Longer streets have houses that are all different."""
+"""Longer streets have houses and monuments that are all different."""
 # So far away that its radius is seen as half a degree, twice the sun's, at the height of the afternoon's sun.
 _SUN_DISTANCE = 400.0
 _SUN_WORLD = _SUN_DISTANCE * np.array([0.42, -0.5, 0.76]) / np.linalg.norm([0.42, -0.5, 0.76])
@@ -163,6 +164,9 @@ def _monuments(side: float, houses: int) -> list[SceneObject]:
     for k in range(houses):
         name, mesh, material, specular = kinds[(k + (2 if side < 0 else 0)) % len(kinds)]
         x, y = -half_length(houses) + LOT * (k + 0.5) + 3.1 * (-1) ** k, side * 6.1
+        if houses > _ALIKE_UP_TO:
+            number = 2 * k + (side < 0)
+            mesh, material = _scaled(mesh, 0.85 + 0.05 * (number % 7)), painted(material, number)
         placed = place_mesh(mesh, rotation_z(40.0 * k + 15.0), x, y, 0.0)
         label = f"{name} {k} {'left' if side > 0 else 'right'}"
         made.append(SceneObject(label, placed, material, specular=specular))
