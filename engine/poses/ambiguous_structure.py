@@ -6,6 +6,7 @@ beside the other part; the true matches between the two then fit nothing, and ar
 every pair of photographs is asked how many of its matches are one point of the model, and how many are two.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,14 +35,24 @@ class PairInliers:
     inliers: Int64[np.ndarray, " p"]
     outliers: Int64[np.ndarray, " p"]
 
+    def select(self, is_selected: Bool[np.ndarray, " p"]) -> "PairInliers":
+        """Return the counts of some of the pairs."""
+        return PairInliers(self.pairs[is_selected], self.inliers[is_selected], self.outliers[is_selected])
 
-def count_pair_inliers(model: Any, database: Path) -> PairInliers:
-    """Count the inlier and outlier matches of all pairs whose two photographs have poses."""
-    points = {
-        number: np.array([p.point3D_id if p.has_point3D() else -1 for p in image.points2D], dtype=np.int64)
-        for number, image in model.images.items()
-        if image.has_pose
-    }
+
+def count_pair_inliers(models: Sequence[Any], database: Path) -> PairInliers:
+    """Count the inlier and outlier matches of all pairs whose two photographs have poses.
+
+    A photograph counts for the first of the models that has it; no point of one model is one of another.
+    """
+    points: dict[int, Int64[np.ndarray, " n"]] = {}
+    for place, model in enumerate(models):
+        for number, image in model.images.items():
+            if image.has_pose and number not in points:
+                points[number] = np.array(
+                    [p.point3D_id * len(models) + place if p.has_point3D() else -1 for p in image.points2D],
+                    dtype=np.int64,
+                )
     with pycolmap.Database.open(database) as source:
         ids, geometries = source.read_two_view_geometries()
     pairs, kept, broken = [], [], []

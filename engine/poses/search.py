@@ -16,7 +16,6 @@ from octasplat.engine.core.scene_layout import MIN_PHOTOGRAPHS
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset.image_info import ImageInfo
 from octasplat.engine.dataset.images import read_image_info
-from octasplat.engine.poses.ambiguous_structure import count_pair_inliers, find_false_pairs, remove_pairs
 from octasplat.engine.poses.config import (
     FEATURES,
     MAPPING_STAGE,
@@ -25,6 +24,13 @@ from octasplat.engine.poses.config import (
     RECORD_FILE,
     RETRY_BELOW_SHARE,
     PosesConfig,
+)
+from octasplat.engine.poses.disambiguation import (
+    MappedModels,
+    describe_gps_contradictions,
+    leave_out_conflicting_pairs,
+    leave_out_pairs_against_gps,
+    register_without_pairs_against_gps,
 )
 from octasplat.engine.poses.features import (
     create_database,
@@ -35,6 +41,7 @@ from octasplat.engine.poses.features import (
     preselect_pairs,
 )
 from octasplat.engine.poses.found_models import write_other_models
+from octasplat.engine.poses.gps_contradictions import GroundPositions, read_ground_positions
 from octasplat.engine.poses.incremental_mapping import best_rank, map_photographs, model_rank
 from octasplat.engine.poses.linking_pairs import NEIGHBORS_BY_NAME, propose_links
 from octasplat.engine.poses.model_selection import distinct_models, is_trustworthy, model_facts
@@ -47,7 +54,6 @@ DATABASE = "database.db"
 MIN_RECOMMENDED_SIDE_PX = 480
 """Below this, what COLMAP finds was seen to be wrong without any sign of it."""
 _FEW_FEATURES = 50
-_MAX_DISAMBIGUATIONS = 3
 
 
 class PoseSearch:
@@ -96,8 +102,8 @@ class PoseSearch:
             DatasetError: too few photographs have poses, or these do not fit.
         """
         count, config = len(self._names), self._config
-        models = self._search(thorough=False)
-        placed = best_rank(models)[0]
+        mapped = self._search(thorough=False)
+        placed = best_rank(mapped.models)[0]
         if placed < count and (count <= config.exhaustive_up_to or placed < RETRY_BELOW_SHARE * count):
             self._progress(
                 Warned(
@@ -106,8 +112,9 @@ class PoseSearch:
                 )
             )
             # max keeps the first of equals: the usual search
-            models = max(models, self._search(thorough=True), key=best_rank)
-        self._check_models(models)
+            mapped = max(mapped, self._search(thorough=True), key=self._search_rank)
+        models = mapped.models
+        self._check_models(mapped)
         names = dict(zip(self._aliases, self._names, strict=True))
         found.mkdir(exist_ok=True)
         for number, model in enumerate(distinct_models(models)):
@@ -121,7 +128,7 @@ class PoseSearch:
             write_json(folder / RECORD_FILE, model_facts(model, self._all_names))
         write_other_models(found)
 
-    def _search(self, *, thorough: bool) -> list[Any]:
+    def _search(self, *, thorough: bool) -> MappedModels:
         """Return the models that the photographs come to, that of most photographs first."""
         database = self._work / ("thorough.db" if thorough else DATABASE)
         self._find_features(database, thorough)
@@ -130,15 +137,17 @@ class PoseSearch:
         # Mapping adds and removes matches: a search that is stopped in it goes on from what was matched.
         database = Path(shutil.copyfile(database, self._work / "mapping.db"))
         with progress_stage(MAPPING_STAGE, count, self._progress) as at:
-            models = self._disambiguate(
-                database,
-                self._map(database, at),
-                at,
-            )
-            if best_rank(models)[0] < count:
-                models = self._register_remaining(database, models, matched, at)
-            at(best_rank(models)[0])
-        return models
+
+            def map_again(copy: Path) -> list[Any]:
+                return self._map(copy, at)
+
+            models = leave_out_conflicting_pairs(self._map(database, at), database, map_again)
+            ground_m = read_ground_positions(database)
+            mapped = leave_out_pairs_against_gps(MappedModels(models), database, ground_m, map_again)
+            if best_rank(mapped.models)[0] < count:
+                mapped = self._register_remaining(database, mapped, matched, ground_m, at)
+            at(best_rank(mapped.models)[0])
+        return mapped
 
     def _find_features(self, database: Path, thorough: bool) -> None:
         with progress_stage(FEATURES, len(self._names), self._progress) as at:
@@ -194,37 +203,20 @@ class PoseSearch:
             )
         return pairs
 
-    def _disambiguate(self, database: Path, models: list[Any], at: Callable[[int], None]) -> list[Any]:
-        """Return the models rebuilt without the false matches of its folds, repeated while it has any."""
-        for _ in range(_MAX_DISAMBIGUATIONS):
-            if not models:
-                break
-            votes = count_pair_inliers(models[0], database)
-            false = find_false_pairs(votes)
-            if len(false) == 0:
-                break
-            # on a copy: the false pairs come back if the trial is no better
-            trial = database.with_name("trial.db")
-            shutil.copyfile(database, trial)
-            remove_pairs(trial, false)
-            again = self._map(trial, at)
-            if best_rank(again)[0] < best_rank(models)[0]:
-                break
-            # fewer matches explained: the cut was no fold
-            if count_pair_inliers(again[0], trial).inliers.sum() <= votes.inliers.sum():
-                break
-            trial.replace(database)
-            models = again
-        return models
-
     def _register_remaining(
-        self, database: Path, models: list[Any], matched: list[Pair], at: Callable[[int], None]
-    ) -> list[Any]:
+        self,
+        database: Path,
+        mapped: MappedModels,
+        matched: list[Pair],
+        ground_m: GroundPositions,
+        at: Callable[[int], None],
+    ) -> MappedModels:
         """Register photographs that the largest model leaves out, with fewer matches required.
 
         They are matched with all others; in a large capture with those that are near by name, and with those
         of the largest model that are near by GPS or look most alike.
         """
+        models = mapped.models
         posed = {number - 1 for number in models[0].reg_image_ids()} if models else set[int]()
         count = len(self._names)
         rest = [k for k in range(count) if k not in posed]
@@ -249,9 +241,12 @@ class PoseSearch:
             start = self._work / "start"
             start.mkdir(exist_ok=True)
             models[0].write_binary(start)
-        again = self._map(database, at, allow_weak_links=True, start=start)
-        # max keeps the first of equals
-        return max(models, again, key=best_rank)
+        return register_without_pairs_against_gps(
+            mapped,
+            database,
+            ground_m,
+            lambda copy: self._map(copy, at, allow_weak_links=True, start=start),
+        )
 
     def _map(
         self,
@@ -347,9 +342,14 @@ class PoseSearch:
                 )
             )
 
-    def _check_models(self, models: Sequence[Any]) -> None:
+    def _search_rank(self, mapped: MappedModels) -> tuple[bool, int, int]:
+        """Return the sort key of searches: models that GPS contradicts come last, then as models do."""
+        is_enough = mapped.placed >= self._config.min_share * len(self._names)
+        return is_enough and mapped.gps_error_m is None, *best_rank(mapped.models)
+
+    def _check_models(self, mapped: MappedModels) -> None:
         """Refuse a result that would only waste the training."""
-        count, config = len(self._names), self._config
+        count, config, models = len(self._names), self._config, mapped.models
         if not models:
             raise DatasetError(
                 "No poses were found: the photographs do not overlap enough, or are blurred or plain; "
@@ -359,7 +359,7 @@ class PoseSearch:
         advice = (
             "take more photographs with more overlap, of things that stand still, or send a COLMAP model."
         )
-        if posed < max(MIN_PHOTOGRAPHS, config.min_share * count):
+        if mapped.placed < max(MIN_PHOTOGRAPHS, config.min_share * count):
             raise DatasetError(
                 f"Only {posed} of {count} photographs could be placed{self._describe_parts(models)}; {advice}"
             )
@@ -368,6 +368,8 @@ class PoseSearch:
             raise DatasetError(
                 f"The poses are not to be trusted ({points} points, {error_px:.1f} px mean error); {advice}"
             )
+        for sentence in describe_gps_contradictions(mapped):
+            self._progress(Warned(sentence))
         if posed < count:
             self._progress(
                 Warned(f"{count - posed} of {count} photographs could not be placed and are left out.")
