@@ -1,4 +1,4 @@
-"""Neighborhoods put to the ground by GPS: in a right model none contradict, in a folded one those across do."""
+"""Neighborhoods put to the ground by GPS: those across a fold contradict; in a right model none do."""
 
 import numpy as np
 import pytest
