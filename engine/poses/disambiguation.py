@@ -144,8 +144,8 @@ def describe_gps_contradictions(mapped: MappedModels) -> list[str]:
         sentences.append(
             "By the GPS of their photographs, parts of the model are turned or displaced against each other "
             f"(photographs there are {mapped.gps_error_m:.1f} m off), as where places that look alike are "
-            "taken for one: look at the poses before a long training, and take more photographs that show "
-            "both parts."
+            "taken for one, or where GPS was far off: look at the poses before a long training, and take "
+            "more photographs that show both parts."
         )
     return sentences
 
