@@ -13,6 +13,7 @@ from octasplat.engine.poses.ambiguous_structure import count_pair_inliers, find_
 from octasplat.engine.poses.gps_contradictions import (
     GroundPositions,
     find_gps_contradictions,
+    find_outliers_against_gps,
     gps_error_m,
 )
 from octasplat.engine.poses.incremental_mapping import best_rank
@@ -50,23 +51,51 @@ class MappedModels:
         return best_rank(self.models)[0]
 
 
-def leave_out_conflicting_pairs(models: list[Any], database: Path, map_again: MapPhotographs) -> list[Any]:
-    """Return the models without the false matches that true ones contradict, repeated while there are any.
+def disambiguate(
+    models: list[Any], database: Path, ground_m: GroundPositions, map_again: MapPhotographs
+) -> MappedModels:
+    """Return the models without the false pairs that GPS contradicts, and those that true ones contradict.
 
     Args:
         models: that the database has come to.
         database: loses the false pairs.
+        ground_m: by GPS.
         map_again: maps a copy of the database.
+    """
+    mapped = leave_out_pairs_against_gps(MappedModels(models), database, ground_m, map_again)
+    models = leave_out_conflicting_pairs(mapped.models, database, ground_m, map_again)
+    if models is mapped.models:
+        return mapped
+    return leave_out_pairs_against_gps(replace(mapped, models=models), database, ground_m, map_again)
+
+
+def leave_out_conflicting_pairs(
+    models: list[Any], database: Path, ground_m: GroundPositions, map_again: MapPhotographs
+) -> list[Any]:
+    """Return the models without the false matches that true ones contradict, repeated while there are any.
+
+    Where false pairs are more than true ones, the true ones look false in a model that is right. GPS tells
+    them apart. The arguments are those of :func:`disambiguate`.
     """
     for _ in range(_MAX_DISAMBIGUATIONS):
         if not models:
             break
-        false = find_false_pairs(count_pair_inliers(models[:1], database))
+        votes = count_pair_inliers(models[:1], database)
+        false = find_false_pairs(votes)
+        if len(false) and ground_m:
+            outliers = find_outliers_against_gps(models[0], votes, database, ground_m)
+            remove_pairs(database, outliers)
+            false = find_false_pairs(count_pair_inliers(models[:1], database))
         if len(false) == 0:
             break
         trial = _copy_without(database, false)
         again = map_again(trial)
         if not _explains_more(again, trial, models, database):
+            break
+        if ground_m and (
+            find_gps_contradictions(again, trial, ground_m).folded
+            and not find_gps_contradictions(models, database, ground_m).folded
+        ):
             break
         trial.replace(database)
         models = again

@@ -1,7 +1,7 @@
 """False pairs of photographs by GPS: those that join parts of a model which GPS puts elsewhere.
 
-:mod:`octasplat.engine.poses.ambiguous_structure` needs true matches that the false ones contradict. Where two
-parts have none, as two sides of a street seen from two walks, GPS alone tells that they are joined falsely.
+:mod:`octasplat.engine.poses.ambiguous_structure` needs more true matches than false ones between two parts.
+Where there are fewer, as between two sides of a street seen from two walks, GPS tells which are false.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -87,24 +87,56 @@ def find_gps_contradictions(
         database: with the matches; is only read.
         ground_m: by GPS.
     """
+    of_model, may_be_folded = _photographs_by_model(models, ground_m)
+    if len(set(of_model.values())) < 2 and not any(may_be_folded):
+        return GpsContradictions(np.zeros((0, 2), np.int64), frozenset())
+    photographs = _Photographs(models, of_model, count_pair_inliers(models, database), ground_m)
+    is_false = photographs.find_false(database, np.array(may_be_folded))
+    return GpsContradictions(photographs.votes.pairs[is_false], photographs.around(is_false))
+
+
+def find_outliers_against_gps(
+    model: Any, votes: PairInliers, database: Path, ground_m: GroundPositions
+) -> Int64[np.ndarray, "f 2"]:
+    """Return the pairs that a model contradicts, and GPS as well: false ones that it was not led by.
+
+    Args:
+        model: a ``pycolmap.Reconstruction``.
+        votes: counts of its pairs.
+        database: with the matches; is only read.
+        ground_m: by GPS.
+    """
+    of_model, _ = _photographs_by_model([model], ground_m)
+    if not of_model:
+        return votes.pairs[:0]
+    photographs = _Photographs([model], of_model, votes, ground_m)
+    return np.asarray(photographs.votes.pairs[photographs.find_false_outliers(database)])
+
+
+def _photographs_by_model(
+    models: Sequence[Any], ground_m: GroundPositions
+) -> tuple[dict[int, int], list[bool]]:
+    """Return the first model of each photograph with GPS, and which models may be folded.
+
+    Models of few such photographs do not count.
+    """
     of_model: dict[int, int] = {}
     may_be_folded = []
     for place, model in enumerate(models):
         numbers = _located(model, ground_m)
-        may_be_folded.append(len(numbers) >= _MIN_PHOTOGRAPHS and not _agrees(model, numbers, ground_m))
-        if len(numbers) >= _MIN_PHOTOGRAPHS:
+        is_enough = len(numbers) >= _MIN_PHOTOGRAPHS
+        may_be_folded.append(is_enough and not _agrees(model, numbers, ground_m))
+        if is_enough:
             of_model = dict.fromkeys(numbers, place) | of_model
-    if len(set(of_model.values())) < 2 and not any(may_be_folded):
-        return GpsContradictions(np.zeros((0, 2), np.int64), frozenset())
-    votes = count_pair_inliers(models, database)
-    votes = votes.select(np.asarray(np.isin(votes.pairs, list(of_model)).all(axis=1)))
-    photographs = _Photographs(models, of_model, votes, ground_m)
-    is_false = photographs.find_false(database, np.array(may_be_folded))
-    return GpsContradictions(votes.pairs[is_false], photographs.around(is_false))
+    return of_model, may_be_folded
 
 
 class _Photographs:
-    """The photographs that have GPS and a pose, and what GPS says of their neighborhoods."""
+    """The photographs that have GPS and a pose, and what GPS says of their neighborhoods.
+
+    Attributes:
+        votes: counts of the pairs of these photographs.
+    """
 
     def __init__(
         self,
@@ -114,8 +146,9 @@ class _Photographs:
         ground_m: GroundPositions,
     ) -> None:
         numbers = sorted(of_model)
-        self._numbers, self._votes = np.array(numbers, np.int64), votes
-        self._links = np.searchsorted(self._numbers, votes.pairs)
+        self._numbers = np.array(numbers, np.int64)
+        self.votes = votes.select(np.asarray(np.isin(votes.pairs, self._numbers).all(axis=1)))
+        self._links = np.searchsorted(self._numbers, self.votes.pairs)
         self._model = np.array([of_model[number] for number in numbers])
         self._images = [models[of_model[number]].image(number) for number in numbers]
         self._cameras = [
@@ -126,12 +159,12 @@ class _Photographs:
         self._rotations = np.stack([image.cam_from_world().rotation.matrix() for image in self._images])
         self._ground_m = np.stack([ground_m[number] for number in numbers])
         self._fits = fit_neighborhoods(
-            self._links, votes.inliers, self._centers, self._rotations, self._ground_m
+            self._links, self.votes.inliers, self._centers, self._rotations, self._ground_m
         )
 
     def find_false(self, database: Path, may_be_folded: Bool[np.ndarray, " m"]) -> Bool[np.ndarray, " p"]:
         """Return which pairs are false."""
-        links, votes, fits = self._links, self._votes, self._fits
+        links, votes, fits = self._links, self.votes, self._fits
         is_turned, is_displaced = find_contradictions(fits, links, self._centers, self._ground_m)
         is_inside = self._is_inside()
         is_asked = np.where(
@@ -141,6 +174,13 @@ class _Photographs:
         is_false = is_inside & is_displaced & may_be_folded[self._model[links[:, 0]]] & holds
         angles = self._angles_to_gps(database, np.flatnonzero(is_asked))
         is_false[is_asked] = np.where(np.isnan(angles), (is_inside & holds)[is_asked], angles > MAX_TURN)
+        return is_false
+
+    def find_false_outliers(self, database: Path) -> Bool[np.ndarray, " p"]:
+        """Return which pairs have more outliers than inliers, and a turn that contradicts GPS."""
+        is_false = (self.votes.outliers > self.votes.inliers) & self._fits.is_known[self._links].all(axis=1)
+        # no number is more than another one
+        is_false[is_false] = self._angles_to_gps(database, np.flatnonzero(is_false)) > MAX_TURN
         return is_false
 
     def around(self, is_false: Bool[np.ndarray, " p"]) -> frozenset[int]:

@@ -28,8 +28,7 @@ from octasplat.engine.poses.config import (
 from octasplat.engine.poses.disambiguation import (
     MappedModels,
     describe_gps_contradictions,
-    leave_out_conflicting_pairs,
-    leave_out_pairs_against_gps,
+    disambiguate,
     register_without_pairs_against_gps,
 )
 from octasplat.engine.poses.features import (
@@ -137,13 +136,10 @@ class PoseSearch:
         # Mapping adds and removes matches: a search that is stopped in it goes on from what was matched.
         database = Path(shutil.copyfile(database, self._work / "mapping.db"))
         with progress_stage(MAPPING_STAGE, count, self._progress) as at:
-
-            def map_again(copy: Path) -> list[Any]:
-                return self._map(copy, at)
-
-            models = leave_out_conflicting_pairs(self._map(database, at), database, map_again)
             ground_m = read_ground_positions(database)
-            mapped = leave_out_pairs_against_gps(MappedModels(models), database, ground_m, map_again)
+            mapped = disambiguate(
+                self._map(database, at), database, ground_m, lambda copy: self._map(copy, at)
+            )
             if best_rank(mapped.models)[0] < count:
                 mapped = self._register_remaining(database, mapped, matched, ground_m, at)
             at(best_rank(mapped.models)[0])

@@ -9,9 +9,11 @@ import numpy as np
 import pycolmap
 import pytest
 
+from octasplat.engine.poses.ambiguous_structure import PairInliers, count_pair_inliers
 from octasplat.engine.poses.disambiguation import (
     MappedModels,
     describe_gps_contradictions,
+    disambiguate,
     leave_out_pairs_against_gps,
     register_without_pairs_against_gps,
 )
@@ -202,19 +204,40 @@ def test_models_that_agree_better_with_gps_are_taken(street: Street, tmp_path: P
         assert pairs_of(database) == pairs_of(street.database)
 
 
-def test_right_model_is_mapped_once(street: Street, tmp_path: Path) -> None:
+def test_right_model_is_mapped_once(street: Street) -> None:
     def never(_copy: Path) -> list[Any]:
         raise AssertionError("nothing is to be mapped again")
 
     ground_m = read_ground_positions(street.database)
-    for models, ground in (
-        ([street.whole], ground_m),
-        (street.parts, ground_m),
-        ([street.folded], {}),
-        ([], ground_m),
-    ):
-        mapped = leave_out_pairs_against_gps(MappedModels(models), street.database, ground, never)
+    cases = (([street.whole], ground_m), (street.parts, ground_m), ([street.folded], {}), ([], ground_m))
+    for models, ground in cases:
+        mapped = disambiguate(models, street.database, ground, never)
         assert mapped == MappedModels(models) and describe_gps_contradictions(mapped) == []
+
+
+@pytest.mark.parametrize("has_gps", [True, False])
+@pytest.mark.parametrize("rest", ["nothing", "a true pair"])
+def test_true_pairs_that_look_false_stay_by_gps(
+    street: Street, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rest: str, has_gps: bool
+) -> None:
+    """The test for conflicts takes a true pair for false while there are many false ones, or in any case."""
+    database = copied(street, tmp_path)
+    ground_m = read_ground_positions(database) if has_gps else {}
+
+    def misled(votes: PairInliers) -> np.ndarray:
+        is_misled = rest == "a true pair" or (votes.outliers > votes.inliers).any()
+        return np.array([[1, 2]] * bool(is_misled), np.int64).reshape(-1, 2)
+
+    def fold(copy: Path) -> list[Any]:
+        copy.write_bytes(street.database.read_bytes())
+        return [street.folded]
+
+    monkeypatch.setattr("octasplat.engine.poses.disambiguation.find_false_pairs", misled)
+    mapped = disambiguate([street.whole], database, ground_m, fold)
+    assert mapped == MappedModels([street.whole if has_gps else street.folded])
+    if has_gps:  # those that are false were left out
+        votes = count_pair_inliers([street.whole], database)
+        assert not ((votes.pairs[:, 0] <= WALK) & (votes.pairs[:, 1] > WALK)).any()
 
 
 @pytest.mark.parametrize("is_folded", [False, True])
