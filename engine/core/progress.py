@@ -17,6 +17,7 @@ PHASE_TITLES = {
     "frames": "Choosing frames",
     "render": "Rendering",
     "edit": "Editing",
+    "simplify": "Simplifying",
     "check": "Checking poses",
     "features": "Finding features",
     "matches": "Matching",

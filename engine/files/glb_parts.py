@@ -1,6 +1,7 @@
 """Scenes for which one GLB is too small: the names of their files, and what each says of its place."""
 
-from collections.abc import Mapping
+import re
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,13 @@ PART_KEY = "octasplat_part"
 def part_paths(path: Path, count: int) -> tuple[Path, ...]:
     """Return the files of a scene for which one is too small: ``path``, ``<stem>.part2.glb`` and so on."""
     return (path, *(path.with_name(f"{path.stem}.part{k}{path.suffix}") for k in range(2, count + 1)))
+
+
+def parts_left_over(path: Path, written: Collection[Path]) -> tuple[Path, ...]:
+    """Return the files beside ``path`` that are called as further parts of it and were not written now."""
+    number = re.compile(rf"{re.escape(path.stem)}\.part\d+{re.escape(path.suffix)}")
+    there = sorted(file for file in path.parent.iterdir() if number.fullmatch(file.name))
+    return tuple(file for file in there if file not in written)
 
 
 def part_extras(part: int, count: int) -> dict[str, object]:

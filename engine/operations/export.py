@@ -198,6 +198,7 @@ def run(
     """
     from octasplat.engine.files import dropped_on_export, read_metadata
     from octasplat.engine.files.export_batch import export_batch
+    from octasplat.engine.files.glb_parts import parts_left_over
     from octasplat.engine.gaussians.materials import require_materials
     from octasplat.engine.operations.scene_io import check_scenes, open_scene
     from octasplat.engine.operations.written_files import remember_written
@@ -234,6 +235,9 @@ def run(
     if failed is not None:
         remember_written("export", files)  # for the same command, once the others can be written
         raise ExportError(failed)
+    for path in (path for path in request.files if path.suffix == ".glb"):
+        for left in parts_left_over(path, files):
+            progress(Warned(f"{left} was not written now: this scene has fewer parts; remove it."))
     return ExportResult(files=files)
 
 

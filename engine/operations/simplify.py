@@ -8,6 +8,7 @@ from pydantic import Field
 
 from octasplat.engine.core.errors import DiskFullError
 from octasplat.engine.core.events import EventListener, PhaseProgress, ignore_events
+from octasplat.engine.core.progress import phase
 from octasplat.engine.operations.base import (
     Operation,
     Options,
@@ -74,10 +75,11 @@ def run(
         progress(PhaseProgress("simplify", count - left, excess))
 
     stop_if(should_stop)
-    try:
-        simplified = simplify(gaussians, request.count, on_round, folder)
-    except DiskFullError:  # files spare memory, and the result may be much smaller than what is on the way
-        simplified = simplify(gaussians, request.count, on_round)
+    with phase("simplify", progress, max(excess, 0)):
+        try:
+            simplified = simplify(gaussians, request.count, on_round, folder)
+        except DiskFullError:  # files spare memory, and the result may be much smaller than what is on the way
+            simplified = simplify(gaussians, request.count, on_round)
     stop_if(should_stop)
     record = scene_io.describe_edit(
         "simplify", options_of(SimplifyOptions, request), gaussians=len(simplified)

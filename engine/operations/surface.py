@@ -114,6 +114,8 @@ class SurfaceOptions(ExtractionOptions, Options):
         room = dict(ROOM_DEFAULTS) if _is_on(given.get("room", False)) else {}
         if given.get("bounds") is not None:
             room.pop("unbounded", None)  # a box says that there are bounds
+        if given.get("voxel") is not None:
+            room.pop("resolution", None)
         materials = MATERIAL_DEFAULTS if _is_on(given.get("materials", False)) else {}
         return {**room, **materials, **given}  # what is given wins over both presets
 

@@ -16,7 +16,7 @@ from octasplat.engine.blocks.block_scene import plan_scene, train_block, train_i
 from octasplat.engine.blocks.piece_progress import PieceProgress
 from octasplat.engine.blocks.piece_training import RESULT, BlockWork
 from octasplat.engine.blocks.scene_plan import COARSE, ScenePlan, block_name, has_plan, load_plan
-from octasplat.engine.core.events import PhaseStarted, Warned, ignore_events
+from octasplat.engine.core.events import Noted, PhaseStarted, Warned, ignore_events
 from octasplat.engine.core.progress import phase
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.dataset.dataset_part import photograph_facts
@@ -134,6 +134,7 @@ class _CoarseDataset:
     def __call__(self, side_px: int) -> Dataset:
         run = self._run
         smaller = run.config.model_copy(update={"max_side": side_px})
+        run.progress(Noted(f"The photographs are opened at {side_px} pixels for the coarse scene."))
         return open_run_dataset(
             run.scene, run.output, smaller, run.threads, ignore_events,
             model_folder=found_model_folder(run.output), cache=_coarse_cache(run),

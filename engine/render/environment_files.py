@@ -98,4 +98,10 @@ def read_background_map(path: Path) -> Float32[np.ndarray, "h w 3"]:
     Raises:
         ConfigError: the file is no such map.
     """
-    return linear_to_srgb(read_environment(path)).astype(np.float32)
+    rgb = read_environment(path)
+    height, width = rgb.shape[:2]
+    if width != 2 * height:
+        raise ConfigError(
+            f"{path}: is {width} x {height} pixels; the background of a run is twice as wide as high."
+        )
+    return linear_to_srgb(rgb).astype(np.float32)

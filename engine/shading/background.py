@@ -79,8 +79,10 @@ class LearnedBackground(WrapperModel):
         super().__init__(inner)
 
     def set_map(self, rgb_srgb: Float32[np.ndarray, "h w 3"]) -> None:
-        """Take another map of this size instead."""
-        assert rgb_srgb.shape == self.rgb_srgb.shape, "a map of another size"
+        """Take another map instead, of any size; what the optimizer knows is kept if the size is the same."""
+        if rgb_srgb.shape != self.rgb_srgb.shape:
+            self.first, self.second = np.zeros((2, *rgb_srgb.shape), np.float32)
+            self.sums = np.zeros(rgb_srgb.shape)
         self.rgb_srgb = np.clip(rgb_srgb, 0, 1).astype(np.float32)
 
     def lookup(self, directions_world: Float32[np.ndarray, "r 3"]) -> Float32[np.ndarray, "r 3"]:

@@ -134,6 +134,13 @@ class ExtractionOptions(BaseModel):
         4.0, gt=0, description="Refuse a volume that takes more memory than this."
     )
 
+    @field_validator("resolution")
+    @classmethod
+    def _is_only_size(cls, resolution: int | None, info: Any) -> int | None:
+        if resolution is not None and info.data.get("voxel") is not None:
+            raise ValueError("voxel and resolution both say how large voxels are; give one of them")
+        return resolution
+
     @field_validator("bounds")
     @classmethod
     def _is_box(cls, bounds: Box | None, info: Any) -> Box | None:

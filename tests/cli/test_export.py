@@ -34,6 +34,14 @@ def glb_json(path):
     return json.loads(content[20 : 20 + length])
 
 
+def test_part_of_an_earlier_larger_scene_is_told(run, octasplat, tmp_path):
+    (tmp_path / "a.part2.glb").touch()
+    (tmp_path / "a.part2.ply").touch()
+    result = octasplat("export", run.output / "scene.ply", tmp_path / "a.glb")
+    assert "a.part2.glb was not written now" in " ".join(result.stderr.split())
+    assert "part2.ply" not in result.stderr
+
+
 def test_colors_of_a_run_are_kept_for_later_exports(run, octasplat, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(run.output, folder)

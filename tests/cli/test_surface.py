@@ -125,6 +125,7 @@ def test_surface_of_file_uses_surrounding_cameras(run, octasplat, tmp_path):
         (("-o", "a.stl"), "written as .glb, .ply, .obj or .usdz"),
         (("-o", "a.ply", "--texture-size", 128), "holds no texture"),
         (("-o", "a.glb", "--unbounded", "--bounds", "0,0,0,1,1,1"), "contradict"),
+        (("-o", "a.glb", "--voxel", "0.1", "--resolution", "64"), "give one of them"),
         (("-o", "a.glb", "--bounds", "0,0,0,1,1,0"), "x0 < x1"),
         (("-o", "a.glb", "--bounds", "90,90,90,91,91,91"), "--bounds"),
         (("-o", "a.glb", "--max-memory", "0.0001"), "allowed"),

@@ -147,6 +147,7 @@ def test_surface_job_color_fit_needs_photographs():
         ({"format": "obj", "materials": True}, "materials are written as .glb"),
         ({"up": "z"}, "up: goes with materials"),
         ({"unbounded": True, "bounds": "0,0,0,1,1,1"}, "contradict"),
+        ({"voxel": 0.1, "resolution": 64}, "give one of them"),
         ({"bounds": "0,0,0,1,1,0"}, "z0 < z1"),
     ],
 )

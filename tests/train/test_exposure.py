@@ -17,6 +17,7 @@ from octasplat.engine.trace.protocol import GaussianGradients, TraceResult
 from octasplat.engine.train.config import TrainConfig
 from octasplat.engine.train.loop.state import TrainState, initial_state
 from octasplat.engine.train.loop.trainer import Trainer
+from octasplat.engine.train.views import exposure_changes
 from octasplat.engine.train.views.exposure_changes import (
     exposure_change_notice,
     relative_log_brightness,
@@ -306,7 +307,7 @@ def test_named_view_is_rendered_with_its_exposure() -> None:
     assert (again.log_gains[2] == 0).all()
 
 
-def test_changing_brightness_is_noticed() -> None:
+def test_changing_brightness_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     world = UnevenWorld()
     rng = np.random.default_rng(3)
     points = rng.uniform(-1, 1, (400, 2))
@@ -321,6 +322,12 @@ def test_changing_brightness_is_noticed() -> None:
     assert np.isnan(found[world.test_indices]).all()
     true = world.log_gains[world.train_indices]
     np.testing.assert_allclose(found[world.train_indices], true - np.median(true), atol=0.08)
+    half = len(world.observations) * len(world.train_indices) // len(world.views) // 2
+    monkeypatch.setattr(exposure_changes, "MAX_OBSERVATIONS", half)
+    of_some = relative_log_brightness(world)
+    assert (of_some != found)[world.train_indices].any()
+    np.testing.assert_allclose(of_some[world.train_indices], true - np.median(true), atol=0.08)
+    monkeypatch.undo()
     learns, reason = resolve_exposure("auto", world, has_materials=False)
     assert learns is True and reason is not None and "1.9 times" in reason
     assert resolve_exposure(False, world, has_materials=False) == (False, None)

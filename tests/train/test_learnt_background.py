@@ -195,6 +195,19 @@ def test_files_keep_the_colors(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_background_map(tmp_path / "background.exr"), colors, atol=1e-6)
 
 
+def test_map_of_another_size_is_shown(tmp_path: Path) -> None:
+    write_background_map(tmp_path / "background.exr", np.full((8, 16, 3), 0.25, np.float32))
+    background = LearnedBackground(16)
+    background.set_map(read_background_map(tmp_path / "background.exr"))
+    np.testing.assert_allclose(background.lookup(np.eye(3, dtype=np.float32)), 0.25, atol=1e-6)
+
+
+def test_map_that_is_not_twice_as_wide_as_high_is_refused(tmp_path: Path) -> None:
+    write_background_map(tmp_path / "background.exr", np.zeros((8, 8, 3), np.float32))
+    with pytest.raises(ConfigError, match=r"background\.exr: is 8 x 8 pixels"):
+        read_background_map(tmp_path / "background.exr")
+
+
 def test_photographs_with_alpha_show_no_background() -> None:
     world = UnderTheSky()
     world.has_alpha = True

@@ -10,6 +10,8 @@ from octasplat.engine.train.sampling.pixel_sampler import TrainingData
 
 MIN_VALUE, MAX_VALUE = 0.1, 0.95
 """Display values beyond which a brightness says little."""
+MAX_OBSERVATIONS = 500_000
+"""Of a capture that has more, one in so many points is asked: each is a read at a random place of a file."""
 MIN_POINTS = 30
 """A photograph that shows fewer points says nothing."""
 ROUNDS = 8
@@ -36,6 +38,8 @@ def relative_log_brightness(dataset: TrackedTrainingData) -> Float64[np.ndarray,
     rows = np.flatnonzero(np.isin(observations.view, dataset.train_indices))
     if len(rows) == 0:
         return brightness
+    step = -(-len(rows) // MAX_OBSERVATIONS)
+    rows = rows[observations.point[rows] % step == 0]
     view = observations.view[rows]
     _, point = np.unique(observations.point[rows], return_inverse=True)
     sizes = np.array([[v.width_px, v.height_px] for v in dataset.views], np.int64)[view]
