@@ -24,7 +24,7 @@ SIDE_STEP = 100.0
 WINDOW_STEP, STOREY = 2.2, 3.0
 """Metres from window to window, along and up."""
 _PLASTERS = ("d9c3a0", "b7c4c9", "c98d6b", "e3ddcf", "9fae8c", "d8b46a", "a9929f", "c7b7a3")
-_DOORS = ("7a2e25", "274156", "3f5a36")
+_WOODS = ("7a2e25", "274156", "3f5a36")
 _FRAMES = ("f4f1ea", "3c4a3e", "5b3a29", "dfe6ea")
 DISTINCT_FROM = 16
 """From this number on no two houses are alike: each has colors, signs and windows of its own."""
@@ -45,14 +45,14 @@ class _Look(NamedTuple):
 def _look(number: int) -> _Look:
     if number < DISTINCT_FROM:
         plaster = linear_from_hex(_PLASTERS[number % 8])
-        frame, door = linear_from_hex(_FRAMES[number % 4]), linear_from_hex(_DOORS[number % 3])
+        frame, door = linear_from_hex(_FRAMES[number % 4]), linear_from_hex(_WOODS[number % 3])
         return _Look(plaster, frame, door, number % 3 == 1, _SIGNS[number % 8], (0.6, 1.15))
     random = np.random.default_rng(number)
     first, second = (linear_from_hex(str(random.choice(_PLASTERS))) for _ in range(2))
     return _Look(
         first + (second - first) * np.float32(random.uniform()),
         linear_from_hex(str(random.choice(_FRAMES))),
-        linear_from_hex(str(random.choice(_DOORS))),
+        linear_from_hex(str(random.choice(_WOODS))),
         bool(random.uniform() < 0.33),
         None,
         (float(random.uniform(0.3, 0.6)), float(random.uniform(0.6, 1.15))),
