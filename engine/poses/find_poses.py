@@ -15,6 +15,7 @@ from typing import IO, Any
 
 from octasplat.engine.core.errors import CancelledError, ColmapCrashError, DatasetError
 from octasplat.engine.core.events import (
+    CheckpointWritten,
     Event,
     EventListener,
     PhaseProgress,
@@ -26,7 +27,9 @@ from octasplat.engine.core.isolated_python import python_command
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.poses.config import (
     DEFAULT_CONFIG,
+    FEATURES,
     FOUND_FOLDER,
+    MATCHES,
     RECORD_FILE,
     GivenModel,
     PosesConfig,
@@ -34,9 +37,13 @@ from octasplat.engine.poses.config import (
 )
 from octasplat.engine.poses.found_models import keep_other_models, read_pose_record
 from octasplat.engine.poses.photographs import photographs_of_scene, photographs_sha256
+from octasplat.engine.poses.stored_search import (
+    SEARCH_FILE,
+    STORED_FROM,
+    search_folder,
+    store_stopped_search,
+)
 
-_SEARCH_FILE = "search.json"
-"""Says which photographs and settings a folder for the work belongs to."""
 _POLL_SECONDS = 0.5
 _HEARTBEAT_SECONDS = 30.0
 """How often a step that takes long tells that it is alive."""
@@ -95,7 +102,14 @@ def find_poses(
         request = PoseSearchRequest(
             images=images.resolve(), names=tuple(names), work=work.resolve(), config=config, threads=threads
         )
-        _ColmapProcess(request, progress, should_stop).wait()
+        process = _ColmapProcess(request, progress, should_stop)
+        try:
+            process.wait()
+        except CancelledError:
+            is_kept = process.stage in (FEATURES, MATCHES) and len(names) >= STORED_FROM
+            if is_kept and (stored := store_stopped_search(work)) is not None:
+                progress(CheckpointWritten(process.step, str(stored)))
+            raise
         record = read_pose_record(work / FOUND_FOLDER)
         write_json(work / FOUND_FOLDER / RECORD_FILE, {**record, "photographs_sha256": sha256})
         (work / FOUND_FOLDER).rename(output)  # in one step: the folder is whole or is not there
@@ -212,12 +226,12 @@ def _work_folder(output: Path, search: Mapping[str, Any] | None = None) -> Itera
         search: what is searched for. The folder of the same search that was stopped is yielded as it was,
             and a block that is stopped keeps it. None always begins with an empty folder.
     """
-    work = output.with_name(f".{output.name}.work")
+    work = search_folder(output)
     if search is None or _stopped_search(work) != search:
         shutil.rmtree(work, ignore_errors=True)
         work.mkdir(parents=True)
         if search is not None:
-            write_json(work / _SEARCH_FILE, dict(search))
+            write_json(work / SEARCH_FILE, dict(search))
     is_kept = False
     try:
         yield work
@@ -232,14 +246,19 @@ def _work_folder(output: Path, search: Mapping[str, Any] | None = None) -> Itera
 def _stopped_search(work: Path) -> dict[str, Any] | None:
     """Return what the search was for that left a folder; None if there is none."""
     try:
-        search: dict[str, Any] = json.loads((work / _SEARCH_FILE).read_text(encoding="utf-8"))
+        search: dict[str, Any] = json.loads((work / SEARCH_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
     return search
 
 
 class _ColmapProcess:
-    """One process of COLMAP's, and what it says."""
+    """One process of COLMAP's, and what it says.
+
+    Attributes:
+        stage: that it is in.
+        step: of the stage.
+    """
 
     def __init__(
         self, request: PoseSearchRequest, progress: EventListener, should_stop: Callable[[], bool]
@@ -247,7 +266,7 @@ class _ColmapProcess:
         self._request = request
         self._progress = progress
         self._should_stop = should_stop
-        self._stage = ""
+        self.stage, self.step = "", 0
         self._last_progress: Event | None = None
         self._last_event_time = time.monotonic()
         self._error: str | None = None
@@ -273,7 +292,7 @@ class _ColmapProcess:
         if self._error is not None:
             raise DatasetError(self._error)
         if not self._is_done:
-            raise ColmapCrashError(_crash_message(code, self._stage, log))
+            raise ColmapCrashError(_crash_message(code, self.stage, log))
 
     def _read_chunk(self, pipe: int) -> bytes:
         """Return the next bytes from the process; empty at its end."""
@@ -302,8 +321,10 @@ class _ColmapProcess:
 
     def _forward_event(self, event: Event) -> None:
         if isinstance(event, PhaseStarted):
-            self._stage = event.stage
+            self.stage, self.step = event.stage, 0
         self._last_progress = event if isinstance(event, PhaseProgress) else None
+        if self._last_progress is not None:
+            self.step = self._last_progress.step
         self._last_event_time = time.monotonic()
         self._progress(event)
 

@@ -1,8 +1,9 @@
 """The models of a mapping that are worth to be kept, and what is recorded of each."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+from octasplat.engine.core.name_lists import name_list
 from octasplat.engine.core.scene_layout import MIN_PHOTOGRAPHS
 from octasplat.engine.poses.config import MAX_REPROJECTION_PX, MIN_POINTS
 
@@ -47,3 +48,18 @@ def model_facts(model: Any, names: Sequence[str]) -> dict[str, Any]:
         "points": model.num_points3D(),
         "mean_reprojection_px": round(float(model.compute_mean_reprojection_error()), 4),
     }
+
+
+def describe_parts(models: Sequence[Any], names: Mapping[str, str]) -> str:
+    """Return which models there are beside the first, for a sentence; empty where there are none.
+
+    Args:
+        models: ``pycolmap.Reconstruction`` each, that of most photographs first.
+        names: of the photographs, by those of the models' images.
+    """
+    parts = [
+        (model.num_reg_images(), sorted(names[model.image(k).name] for k in model.reg_image_ids()))
+        for model in distinct_models(models)[1:]
+    ]
+    listed = ", ".join(f"{placed} ({name_list(which)})" for placed, which in parts)
+    return f" together, apart from models of {listed} that no matches link" if parts else ""

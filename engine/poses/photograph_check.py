@@ -1,11 +1,13 @@
 """Photographs are read to their ends before poses are searched, which takes far longer."""
 
+import contextlib
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from octasplat.engine.core.errors import DatasetError
+from octasplat.engine.dataset.image_info import ImageInfo
 from octasplat.engine.dataset.images import read_image_info, read_photo
 
 DECODING_BYTES = 2 << 30
@@ -55,3 +57,12 @@ def check_photographs_decode(
                 on_count(done)
         finally:
             pool.shutdown(cancel_futures=True)
+
+
+def read_image_infos(images: Path, names: Sequence[str]) -> dict[str, ImageInfo]:
+    """Return what the headers of photographs say, for those that can be read."""
+    found: dict[str, ImageInfo] = {}
+    for name in names:
+        with contextlib.suppress(DatasetError):
+            found[name] = read_image_info(images / name)
+    return found

@@ -1,6 +1,5 @@
 """The search for poses, from photographs to a model that can be trusted; runs in a process of its own."""
 
-import contextlib
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -10,12 +9,9 @@ import pycolmap
 
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.events import EventListener, PhaseProgress, Warned
-from octasplat.engine.core.name_lists import name_list
 from octasplat.engine.core.progress import phase
 from octasplat.engine.core.scene_layout import MIN_PHOTOGRAPHS
 from octasplat.engine.core.writing import write_json
-from octasplat.engine.dataset.image_info import ImageInfo
-from octasplat.engine.dataset.images import read_image_info
 from octasplat.engine.poses.config import (
     FEATURES,
     MAPPING_STAGE,
@@ -43,13 +39,23 @@ from octasplat.engine.poses.found_models import write_other_models
 from octasplat.engine.poses.gps_contradictions import GroundPositions, read_ground_positions
 from octasplat.engine.poses.incremental_mapping import best_rank, map_photographs, model_rank
 from octasplat.engine.poses.linking_pairs import NEIGHBORS_BY_NAME, propose_links
-from octasplat.engine.poses.model_selection import distinct_models, is_trustworthy, model_facts
+from octasplat.engine.poses.model_selection import (
+    describe_parts,
+    distinct_models,
+    is_trustworthy,
+    model_facts,
+)
 from octasplat.engine.poses.pairs import Pair, all_pairs, pair_count, pairs_with
-from octasplat.engine.poses.photograph_check import check_photographs_decode
+from octasplat.engine.poses.photograph_check import check_photographs_decode, read_image_infos
+from octasplat.engine.poses.stored_search import (
+    DATABASE,
+    SearchKeeper,
+    adopt_stored_database,
+    read_pairs,
+    write_pairs,
+)
 from octasplat.engine.poses.workspace import link_photographs, progress_stage
 
-DATABASE = "database.db"
-"""Of the first search, in the folder for the work."""
 MIN_RECOMMENDED_SIDE_PX = 480
 """Below this, what COLMAP finds was seen to be wrong without any sign of it."""
 _FEW_FEATURES = 50
@@ -78,12 +84,13 @@ class PoseSearch:
     ) -> None:
         self._images = images
         self._all_names = tuple(names)
-        self._infos = _read_image_infos(images, names)
+        self._infos = read_image_infos(images, names)
         self._names = tuple(self._infos)
         self._work = work
         self._config = config
         self._threads = threads or -1
         self._progress = progress
+        adopt_stored_database(work)
         self._photographs = work / "photographs"
         self._aliases = link_photographs(images, self._names, self._photographs)
         pycolmap.logging.minloglevel = 2  # its warnings are of use to nobody here
@@ -146,12 +153,19 @@ class PoseSearch:
         return mapped
 
     def _find_features(self, database: Path, thorough: bool) -> None:
-        with progress_stage(FEATURES, len(self._names), self._progress) as at:
+        count = len(self._names)
+        with progress_stage(FEATURES, count, self._progress) as at:
             if not database.exists():
                 new = database.with_suffix(".new")
                 new.unlink(missing_ok=True)
                 create_database(new, self._photographs, self._aliases, one_camera=self._one_camera)
                 new.rename(database)
+            keeper = SearchKeeper(database, count, self._progress)
+
+            def tell(done: int) -> None:
+                at(done)
+                keeper.keep_at_times(done)
+
             extract_features(
                 database,
                 self._photographs,
@@ -160,9 +174,10 @@ class PoseSearch:
                 thorough=thorough,
                 one_camera=self._one_camera,
                 threads=self._threads,
-                on_count=at,
+                on_count=tell,
             )
-        counts = feature_counts(database, len(self._names))
+            keeper.keep(count)
+        counts = feature_counts(database, count)
         poor = [name for name, found in zip(self._names, counts, strict=True) if found < _FEW_FEATURES]
         if poor:
             self._progress(
@@ -176,8 +191,13 @@ class PoseSearch:
         def tell(settled: int, work_done: float) -> None:
             self._progress(PhaseProgress(MATCHES, settled, total, work_done=work_done))
 
+        keeper = SearchKeeper(database, count, self._progress)
         with phase(MATCHES, self._progress, total):
-            if look_share:
+            if not look_share:
+                pairs = all_pairs(count)
+            elif (known := read_pairs(database)) is not None:
+                pairs = known
+            else:
                 pairs = preselect_pairs(
                     database,
                     self._aliases,
@@ -185,9 +205,13 @@ class PoseSearch:
                     threads=self._threads,
                     on_look=lambda unlike, looked: tell(unlike, look_share * looked),
                 )
-            else:
-                pairs = all_pairs(count)
+                write_pairs(database, pairs)
             unlike, wanted = total - len(pairs), max(len(pairs), 1)
+
+            def tell_matched(done: int) -> None:
+                tell(unlike + done, look_share + (1 - look_share) * done / wanted)
+                keeper.keep_at_times(unlike + done)
+
             match_pairs(
                 database,
                 self._aliases,
@@ -195,8 +219,9 @@ class PoseSearch:
                 config,
                 thorough=thorough,
                 threads=self._threads,
-                on_count=lambda done: tell(unlike + done, look_share + (1 - look_share) * done / wanted),
+                on_count=tell_matched,
             )
+            keeper.keep(total, is_final=True)
         return pairs
 
     def _register_remaining(
@@ -352,12 +377,14 @@ class PoseSearch:
                 "take more of them from nearby places, or send a COLMAP model."
             )
         posed, points = model_rank(models[0])
+        names = dict(zip(self._aliases, self._names, strict=True))
         advice = (
             "take more photographs with more overlap, of things that stand still, or send a COLMAP model."
         )
         if mapped.placed < max(MIN_PHOTOGRAPHS, config.min_share * count):
             raise DatasetError(
-                f"Only {posed} of {count} photographs could be placed{self._describe_parts(models)}; {advice}"
+                f"Only {posed} of {count} photographs could be placed{describe_parts(models, names)}; "
+                f"{advice}"
             )
         error_px = float(models[0].compute_mean_reprojection_error())
         if not is_trustworthy(models[0]):
@@ -370,22 +397,3 @@ class PoseSearch:
             self._progress(
                 Warned(f"{count - posed} of {count} photographs could not be placed and are left out.")
             )
-
-    def _describe_parts(self, models: Sequence[Any]) -> str:
-        """Return which other models there are, for a sentence; empty where there are none."""
-        names = dict(zip(self._aliases, self._names, strict=True))
-        parts = [
-            (model.num_reg_images(), sorted(names[model.image(k).name] for k in model.reg_image_ids()))
-            for model in distinct_models(models)[1:]
-        ]
-        listed = ", ".join(f"{placed} ({name_list(which)})" for placed, which in parts)
-        return f" together, apart from models of {listed} that no matches link" if parts else ""
-
-
-def _read_image_infos(images: Path, names: Sequence[str]) -> dict[str, ImageInfo]:
-    """Return what the headers of photographs say, for those that can be read."""
-    found: dict[str, ImageInfo] = {}
-    for name in names:
-        with contextlib.suppress(DatasetError):
-            found[name] = read_image_info(images / name)
-    return found

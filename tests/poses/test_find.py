@@ -16,9 +16,20 @@ import pytest
 from jaxtyping import Float64
 
 from octasplat.engine.core.errors import CancelledError, ColmapCrashError, DatasetError
-from octasplat.engine.core.events import Event, PhaseFinished, PhaseProgress, PhaseStarted, Warned
+from octasplat.engine.core.events import (
+    CheckpointWritten,
+    Event,
+    PhaseFinished,
+    PhaseProgress,
+    PhaseStarted,
+    Warned,
+)
+from octasplat.engine.core.writing import write_json
+from octasplat.engine.poses import stored_search
 from octasplat.engine.poses.find_poses import PosesConfig, find_poses
+from octasplat.engine.poses.photographs import photographs_sha256
 from octasplat.engine.poses.search import PoseSearch
+from octasplat.engine.poses.stored_search import SEARCH_FILE, STORED_SEARCH_FILES, search_folder
 from octasplat.engine.render.image_files import write_png
 from tests.support.neighbouring_photographs import write_neighbours
 
@@ -204,6 +215,48 @@ def test_stopped_search_goes_on_with_its_features_and_matches(
         path.name: path.read_bytes() for path in found_at_once.model.iterdir()
     }
     assert [path.name for path in tmp_path.iterdir()] == ["stopped"]
+
+
+@pytest.mark.exhaustive
+def test_search_goes_on_in_another_folder_from_what_was_stored(
+    taken: Photographs, found_at_once: Found, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stored_search, "STORED_FROM", 2)
+    names = tuple(sorted(taken.centres_world))
+    work = tmp_path / "work"
+    work.mkdir()
+    stored: list[int] = []
+
+    def store(event: Event) -> None:
+        """Copy the files that another host would be given."""
+        if isinstance(event, CheckpointWritten):
+            elsewhere = tmp_path / f"poses{len(stored)}"
+            search_folder(elsewhere).mkdir()
+            for name in STORED_SEARCH_FILES:
+                if (work / name).exists():
+                    shutil.copyfile(work / name, search_folder(elsewhere) / name)
+            write_json(
+                search_folder(elsewhere) / SEARCH_FILE,
+                {
+                    "photographs_sha256": photographs_sha256(taken.folder, names),
+                    "config": PosesConfig().model_dump(mode="json"),
+                },
+            )
+            stored.append(event.iteration)
+
+    PoseSearch(taken.folder, names, work, PosesConfig(), 1, store).run(tmp_path / "found")
+    assert stored == [COUNT, COUNT * (COUNT - 1) // 2]
+    for number, counted in enumerate(({"features": COUNT}, {"features": COUNT, "matches": stored[1]})):
+        events: list[Event] = []
+        find_poses(taken.folder, tmp_path / f"poses{number}", threads=2, progress=events.append)
+        first: dict[str, int] = {}
+        for event in events:
+            if isinstance(event, PhaseProgress) and event.step:
+                first.setdefault(event.stage, event.step)
+        assert "read" not in first and counted.items() <= first.items()
+        assert {path.name: path.read_bytes() for path in (tmp_path / f"poses{number}").iterdir()} == {
+            path.name: path.read_bytes() for path in found_at_once.model.iterdir()
+        }
 
 
 @pytest.mark.exhaustive

@@ -53,7 +53,7 @@ class Checkpoint:
 
     def is_after(self, other: "Checkpoint | None") -> bool:
         """Return whether the work is further than at ``other``."""
-        order = {"poses": 0, "load": 1, "train": 2, "evaluate": 3, "export": 4}
+        order = {"features": -2, "matches": -1, "poses": 0, "load": 1, "train": 2, "evaluate": 3, "export": 4}
         if other is None:
             return True
         return (order.get(self.stage, 0), self.step) > (order.get(other.stage, 0), other.step)

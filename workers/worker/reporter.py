@@ -45,6 +45,7 @@ PROGRESS_LINE_SECONDS = 30.0
 """How often the log says how far the job is."""
 _MAX_PENDING_LINES = 2_000
 _MAX_PENDING_EVENTS = 1_000
+_STAGES_OF_POSE_SEARCH = ("features", "matches")
 _STORED_EVENT_KINDS = ("stage_started", "stage_finished", "held_out_measured", "warning", "run_finished")
 _IGNORED_ERRORS = (psycopg.Error, PoolTimeout, TimeoutError, OSError)
 
@@ -288,6 +289,9 @@ class Reporter:
             try:
                 await self._attempt.record_checkpoint(checkpoint.as_row(), is_progress=advances, lease=note)
             except QuotaExceededError as error:
+                if stage in _STAGES_OF_POSE_SEARCH:  # which is much larger than what comes of it
+                    self.add_note(f"Warning: the state of the search for poses is not kept: {error}")
+                    return
                 # No more of them, as each would lie in the store for a while although nothing names it.
                 self._stores_checkpoints = False
                 self.add_note(f"Warning: from here on no checkpoints are kept: {error}")

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import IO
 
 from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.poses.stored_search import STORED_DATABASE, STORED_SEARCH_FILES, search_folder
 from octasplat.workers.db.rows import Artifact, DatasetFile, Job
 from octasplat.workers.queue.job_results import ResultFile
 from octasplat.workers.sandbox.job_users import JobUser, give_folder, open_for_reading, take_user
@@ -56,6 +57,9 @@ _CHECKPOINT_FILES = (
     "run/plan.json", "run/georeference.json", "run/scene.ply", "run/checkpoints/best.npz",
     "run/start/best.npz", "run/start/views.json", START_RECORD,
 )  # fmt: skip
+_SEARCH_FILES = tuple(
+    f"{RUN_FOLDER}/{search_folder(Path(POSES_FOLDER)).name}/{name}" for name in STORED_SEARCH_FILES
+)
 _BLOCKS = f"{RUN_FOLDER}/{BLOCKS_FOLDER}"
 _BLOCK = re.compile(r"block_\d+")
 """The pieces of which each has a job of its own."""
@@ -342,6 +346,7 @@ class Workspace:
             poses = sorted(f"{found}/{name}" for name in folder.names(found))
             checkpoints = _directly_below(folder, f"{RUN_FOLDER}/checkpoints")
             pieces = list(_piece_files(folder, self._own_block))
+            search = [name for name in _SEARCH_FILES if folder.is_file(name)]
         if self._own_block is not None:  # all else is the whole job's
             return pieces
         names += [*poses, *pieces]
@@ -350,7 +355,9 @@ class Workspace:
         newest = max((name for name in checkpoints if _CHECKPOINT.fullmatch(name)), default=None)
         if newest is not None:
             return [*names, newest]
-        return names if poses or pieces else []
+        if poses or pieces:
+            return names
+        return [*names, *search] if any(name.endswith(STORED_DATABASE) for name in search) else []
 
 
 def _piece_files(folder: UntrustedFolder, own_block: str | None) -> Iterator[str]:

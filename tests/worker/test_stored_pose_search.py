@@ -1,0 +1,65 @@
+"""What a worker stores of a search for poses, and what another one begins with."""
+
+import itertools
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+from octasplat.engine.poses.stored_search import STORED_DATABASE, STORED_SEARCH_FILES
+from octasplat.workers.db.rows import Job
+from octasplat.workers.storage.local import LocalStorage
+from octasplat.workers.worker.checkpoint import Checkpoint
+from octasplat.workers.worker.workspace import Workspace
+
+SEARCH = "run/.poses.work"
+
+
+def make_job(attempt: int) -> Job:
+    given: dict[str, Any] = dict.fromkeys(Job.__dataclass_fields__)
+    given |= {"id": uuid4(), "kind": "reconstruct", "options": {}, "attempt": attempt, "fresh_after": 0}
+    return Job(**{**given, "created_at": datetime.now(UTC)})
+
+
+def test_state_of_a_search_is_restored_until_poses_are_there(tmp_path: Path) -> None:
+    storage = LocalStorage(tmp_path / "store", floor_bytes=0)
+    first = Workspace(tmp_path / "work", make_job(1), storage)
+    first.open()
+    work = first.folder / SEARCH
+    work.mkdir(parents=True)
+    (work / "search.json").write_text("{}")
+    (work / "database.db").write_bytes(b"is being written")
+    assert first.store_checkpoint("features", 50) is None
+    (work / STORED_DATABASE).write_bytes(b"features")
+    (work / "pairs.json").write_text("[]")
+    stored = first.store_checkpoint("features", 100)
+    assert stored is not None and {file.path for file in stored.files} == {
+        f"{SEARCH}/{name}" for name in STORED_SEARCH_FILES
+    }
+    second = Workspace(tmp_path / "work", make_job(2), storage)
+    second.open()
+    second.restore(Checkpoint.from_row(stored.as_row()))
+    there = second.folder / SEARCH
+    assert {path.name for path in there.iterdir()} == set(STORED_SEARCH_FILES)
+    assert (there / STORED_DATABASE).read_bytes() == b"features"
+    with (there / STORED_DATABASE).open("ab") as file:  # it is gone on with, and the stored one stays
+        file.write(b" and matches")
+    again = Workspace(tmp_path / "work", make_job(3), storage)
+    again.open()
+    again.restore(stored)
+    assert (again.folder / SEARCH / STORED_DATABASE).read_bytes() == b"features"
+    (second.folder / "run" / "poses").mkdir()
+    (second.folder / "run" / "poses" / "images.bin").write_bytes(b"poses")
+    found = second.store_checkpoint("poses", 0)
+    assert found is not None and [file.path for file in found.files] == ["run/poses/images.bin"]
+    for workspace in (first, second, again):
+        workspace.close()
+
+
+def test_states_of_a_search_come_before_its_poses() -> None:
+    order = [
+        Checkpoint(1, stage, step, ())
+        for stage, step in (("features", 40), ("features", 90), ("matches", 5), ("poses", 0), ("train", 1))
+    ]
+    for before, after in itertools.pairwise(order):
+        assert after.is_after(before) and not before.is_after(after)
