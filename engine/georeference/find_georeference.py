@@ -111,9 +111,8 @@ def _from_control_points(
             continue
         position = points.control_position(point)
         if position is None:
-            note(
-                f"{control.path}: {point.name} is left out, as fewer than two of its photographs have poses."
-            )
+            few = "fewer than two of its photographs have poses" if point.marks else "it has no pose"
+            note(f"{control.path}: {point.name} is left out, as {few}.")
             continue
         names.append(point.name)
         scene.append(position)
