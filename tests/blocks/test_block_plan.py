@@ -11,6 +11,7 @@ from click.testing import CliRunner
 
 from octasplat.__main__ import cli
 from octasplat.engine.blocks.block_map import SIDE_PX, draw_block_map
+from octasplat.engine.blocks.partition import Box
 from octasplat.engine.blocks.piece_settings import (
     block_settings,
     fewest_blocks,
@@ -19,7 +20,7 @@ from octasplat.engine.blocks.piece_settings import (
 )
 from octasplat.engine.blocks.sparse_plan import plan_from_points
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.dataset import load_dataset_model
+from octasplat.engine.dataset import SparsePoints, load_dataset_model
 from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.block_cost import BlockShare, estimate_blocks, estimate_with_blocks
 from octasplat.engine.operations.block_options import BlockOptions, parse_memory
@@ -74,6 +75,40 @@ def test_map_has_a_color_at_the_middle_of_each_block(scene: Path) -> None:
         found, counts = np.unique(near[near.min(axis=1) < 0.9], axis=0, return_counts=True)
         colors.append(tuple(found[counts.argmax()]))
     assert len(set(colors)) == 4
+
+
+EAST, NORTH, UP = np.eye(3)
+
+
+@pytest.mark.parametrize(
+    "world", [[EAST, NORTH, UP], [EAST, -UP, NORTH], [NORTH, UP, EAST], [UP, EAST, NORTH]]
+)
+@pytest.mark.parametrize(("other", "viewer"), [(NORTH, UP), (UP, -NORTH)])
+def test_map_is_seen_from_above_or_as_by_the_cameras(
+    scene: Path, world: Any, other: np.ndarray, viewer: np.ndarray
+) -> None:
+    """Ground, or a wall seen from the south, in worlds whose axes are these."""
+    turn, model = np.array(world), load_dataset_model(scene)
+    middles = np.stack([0 * EAST, 3 * EAST, 2 * other]) @ turn.T
+    places = np.concatenate(
+        [middle + np.random.default_rng(0).normal(0, 0.02, (20, 3)) for middle in middles]
+    )
+    points = SparsePoints(
+        places.astype(np.float32), np.zeros((60, 3), np.float32), np.ones(60, np.int32),
+        np.zeros(60, np.float32), np.arange(60),
+    )  # fmt: skip
+    rotation = np.stack([EAST, -UP, NORTH]) @ turn.T
+    position = turn @ (5 * viewer + EAST)
+    views = tuple(
+        replace(view, rotation_cam_from_world=rotation, translation_cam_from_world=-rotation @ position)
+        for view in model.views
+    )
+    drawn = draw_block_map(
+        replace(model, points=points, views=views), [Box(middle - 1, middle + 1) for middle in middles]
+    )
+    east, above = drawn.middles[1:] - drawn.middles[0]
+    assert east[0] * above[1] - east[1] * above[0] < -0.01  # counterclockwise, where y is down
+    assert other is NORTH or (east[0] > 0.1 and above[1] < -0.1)
 
 
 def test_number_of_blocks_grows_with_photographs_and_with_gaussians_that_do_not_fit() -> None:
