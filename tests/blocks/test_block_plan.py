@@ -11,6 +11,7 @@ from click.testing import CliRunner
 
 from octasplat.__main__ import cli
 from octasplat.engine.blocks.block_map import SIDE_PX, draw_block_map
+from octasplat.engine.blocks.block_plan import Block
 from octasplat.engine.blocks.partition import Box
 from octasplat.engine.blocks.piece_settings import (
     block_settings,
@@ -18,14 +19,20 @@ from octasplat.engine.blocks.piece_settings import (
     finish_settings,
     polish_settings,
 )
+from octasplat.engine.blocks.scene_plan import ScenePlan, save_plan
 from octasplat.engine.blocks.sparse_plan import plan_from_points
 from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.events import ignore_events
 from octasplat.engine.dataset import SparsePoints, load_dataset_model
 from octasplat.engine.dataset.image_sizes import ImageSizes
+from octasplat.engine.dataset.view_tiles import Rectangles
 from octasplat.engine.operations.block_cost import BlockShare, estimate_blocks, estimate_with_blocks
 from octasplat.engine.operations.block_options import BlockOptions, parse_memory
 from octasplat.engine.operations.cost_model import estimate_reconstruction, gaussians_within
 from octasplat.engine.operations.plan import PlanRequest, run
+from octasplat.engine.pipeline import BlockRequest
+from octasplat.engine.pipeline.block_steps import count_blocks
+from octasplat.engine.pipeline.run import ReconstructionRun
 from octasplat.engine.runs.config import resolve_config
 from octasplat.engine.train.config import TrainConfig
 from tests.support.tiny_dataset import make_tiny_dataset
@@ -75,6 +82,19 @@ def test_map_has_a_color_at_the_middle_of_each_block(scene: Path) -> None:
         found, counts = np.unique(near[near.min(axis=1) < 0.9], axis=0, return_counts=True)
         colors.append(tuple(found[counts.argmax()]))
     assert len(set(colors)) == 4
+
+
+def test_planned_run_has_the_blocks_of_its_plan(scene: Path, tmp_path: Path) -> None:
+    """Also where a later version would make another number of blocks of the same photographs."""
+    found = plan_from_points(load_dataset_model(scene), np.arange(12), 3)
+    none = Rectangles(np.zeros(0, np.int64), *np.zeros((2, 0, 2), np.int64))
+    blocks = tuple(Block(block.core, np.zeros(3), block.share, none) for block in found)
+    (tmp_path / "blocks").mkdir()
+    save_plan(ScenePlan(blocks, (0, 0, 0), 10, 10, None, True), tmp_path / "blocks")
+    planned = ReconstructionRun(
+        scene, tmp_path, resolve_config("standard"), 1, ignore_events, lambda: False, blocks=BlockRequest()
+    )
+    assert count_blocks(planned) == 3
 
 
 EAST, NORTH, UP = np.eye(3)
