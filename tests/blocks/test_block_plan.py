@@ -10,6 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from octasplat.__main__ import cli
+from octasplat.engine.blocks import piece_settings
 from octasplat.engine.blocks.block_map import SIDE_PX, draw_block_map
 from octasplat.engine.blocks.block_plan import Block
 from octasplat.engine.blocks.partition import Box
@@ -199,6 +200,15 @@ def test_what_cannot_be_planned_is_refused_in_a_sentence(
 ) -> None:
     with pytest.raises(ConfigError, match=sentence):
         run(PlanRequest(source=scene, **options))
+
+
+def test_refused_plan_leaves_no_picture(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of an automatic number it shows late whether there are several blocks."""
+    monkeypatch.setattr(piece_settings, "AUTO_VIEWS", 5)
+    picture = tmp_path / "map.png"
+    with pytest.raises(ConfigError, match="materials"):
+        run(PlanRequest(source=scene, blocks="auto", materials=True, picture=picture))
+    assert not picture.exists()
 
 
 def test_command_prints_the_plan(scene: Path) -> None:

@@ -248,7 +248,10 @@ async def drop_lost_blocks(connection: Connection, root: Job, lost: Collection[s
             [root.id, root.fresh_after, message],
         )
         if await cursor.fetchone() is not None:
-            raise BlobNotFoundError(f"The results of block {number} are gone from the store once more.")
+            raise BlobNotFoundError(
+                f"The results of block {number} are gone from the store once more; see to the store, and "
+                "retry the job from the start."
+            )
         error = {"type": BlobNotFoundError.error_type, "message": message}
         await replace_artifacts(connection, child, [])
         await connection.execute(
