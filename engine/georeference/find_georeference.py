@@ -43,6 +43,8 @@ def find_georeference(
     if request.source == "off":
         return None
     points = ScenePoints(dataset, request.control)
+    for path in request.unread:
+        note(f"{path} is not read, since there are others; control_points={path.name} takes it instead.")
     found = None
     if request.source == "auto" and request.control is not None and _has_positions(request.control):
         found = _from_control_points(points, request.control, note)

@@ -167,12 +167,15 @@ def test_photographs_without_a_pose_are_not_taken_for_others_of_their_name(scene
         find(scene, tmp_path, None, f"later/{first} {second} 2")
 
 
-def test_switched_control_point_is_left_out(scene, tmp_path):
+def test_switched_control_point_and_a_second_file_are_left_out_with_a_word(scene, tmp_path):
     ground = apply(truth_matrix(), POINTS)
     ground[4] += (6.0, 0.0, 0.0)
     (scene / "gcp_list.txt").write_text(gcp_list(scene, ground, "EPSG:32632"))
-    found = find(scene, tmp_path)
+    (scene / "control_points.csv").write_text("name,x,y,z")
+    notes: list[str] = []
+    found = find(scene, tmp_path, note=notes.append)
     assert found.residuals.left_out == ("gcp4",)
+    assert notes[0].startswith(f"{scene / 'control_points.csv'} is not read") and len(notes) == 2
     assert found.metres_per_unit == pytest.approx(SCALE, rel=1e-6)
 
 
