@@ -104,6 +104,12 @@ async def test_progress_and_time_left_are_of_all_blocks(connect_service: Connect
         told = {event["kind"]: event["data"] for event in timeline}
         assert told["blocks_queued"] == {"blocks": 2, "done": 0}
         assert told["block_finished"] == {"block": 1, "left": 1}
+        await other.succeed([], job_queue=service.job_queue)
+        queued = await read(http, job)
+        await claim_job(service, job)
+        for view in (queued, await read(http, job)):  # the merge begins where the blocks have ended
+            assert (view["stage"], view["step"], view["total_steps"]) == ("train", 35, 40)
+            assert view["progress"] > seen.json()["progress"]
 
 
 async def test_job_is_one_start_and_its_time_is_that_of_the_whole(connect_service: ConnectService) -> None:

@@ -355,8 +355,14 @@ async def _give_up(connection: Connection, root: Job, ended: Sequence[Job], coun
 
 async def _continue_root(connection: Connection, job_queue: JobQueue, root: Job) -> None:
     """Queue a job whose blocks are done; its next attempt is a part of the same start."""
+    # Its own steps were those before the blocks; it is as far as they all are from now on.
     await connection.execute(
-        "UPDATE jobs SET continuations = continuations || %s WHERE id = %s", [[root.attempt + 1], root.id]
+        """
+        UPDATE jobs SET continuations = continuations || %(next)s, step = least(total_steps, step + (
+            SELECT coalesce(sum((options->>'iterations')::int), 0) FROM jobs WHERE root_id = %(id)s))
+        WHERE id = %(id)s
+        """,
+        {"next": [root.attempt + 1], "id": root.id},
     )
     await requeue_job(connection, job_queue, root)
 
