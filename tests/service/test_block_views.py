@@ -87,6 +87,7 @@ async def test_progress_and_time_left_are_of_all_blocks(connect_service: Connect
         await attempt.set_progress(stage="load", step=12, total_steps=15, seconds_left=1.0)
         loading = await read(http, job)  # photographs that were read are no iterations
         assert (loading["step"], loading["seconds_left"]) == (5, None)
+        assert loading["blocks"][0]["state"] == "running" and loading["blocks"][0]["step"] is None
         await attempt.set_progress(stage="train", step=10, total_steps=20, seconds_left=30.0)
         seen = await http.get(f"/v1/jobs/{job['id']}", headers={"If-None-Match": tag})
         assert seen.status_code == 200
