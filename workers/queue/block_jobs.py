@@ -358,8 +358,9 @@ async def _continue_root(connection: Connection, job_queue: JobQueue, root: Job)
     # Its own steps were those before the blocks; it is as far as they all are from now on.
     await connection.execute(
         """
-        UPDATE jobs SET continuations = continuations || %(next)s, step = least(total_steps, step + (
-            SELECT coalesce(sum((options->>'iterations')::int), 0) FROM jobs WHERE root_id = %(id)s))
+        UPDATE jobs SET continuations = continuations || %(next)s,
+            step = least(total_steps, coalesce(step, 0) + (
+                SELECT coalesce(sum((options->>'iterations')::int), 0) FROM jobs WHERE root_id = %(id)s))
         WHERE id = %(id)s
         """,
         {"next": [root.attempt + 1], "id": root.id},
