@@ -23,7 +23,8 @@ def with_block_progress(root: Job, blocks: Sequence[Job]) -> Job:
     running = [
         (block.seconds_left, length - steps)
         for block, length, steps in zip(blocks, lengths, done, strict=True)
-        if block.state == "running" and block.seconds_left is not None and length > steps
+        if block.state == "running" and _is_trained_now(block) and block.seconds_left is not None
+        if length > steps
     ]
     if not running:
         return replace(root, step=step)
@@ -40,4 +41,11 @@ def _iterations(block: Job) -> int:
 
 
 def _done(block: Job, length: int) -> int:
-    return length if block.state == "succeeded" else min(block.step or 0, length)
+    if block.state == "succeeded":
+        return length
+    return min(block.step or 0, length) if _is_trained_now(block) else 0
+
+
+def _is_trained_now(block: Job) -> bool:
+    """Return whether steps and time left of a block are iterations, not those of reading its photographs."""
+    return block.stage == "train"

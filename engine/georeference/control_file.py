@@ -28,6 +28,8 @@ MAX_BYTES = 10_000_000
 _COLUMNS = {"image": "photograph", "im_x": "px", "im_y": "py", "label": "name", "gcp_name": "name"}
 _PROJECTED_AMONG_DEGREES = frozenset((*range(4491, 4555), 4647))
 """EPSG codes of projected systems in metres, of CGCS2000 and of Germany, among those that give degrees."""
+_MERCATOR = frozenset((3395, 3785, 3857, 54004, 102100, 102113, 900913))
+"""EPSG codes, and others used as such, of the whole Earth on one map, with metres at the equator alone."""
 _EPSG = re.compile(r"EPSG", re.IGNORECASE)
 _LOCAL = re.compile(r"^local$", re.IGNORECASE)
 _OTHER_SYSTEM = re.compile(r"\bUTM\b|\+proj|\bWGS ?84\b", re.IGNORECASE)
@@ -199,6 +201,11 @@ def _parse_crs(path: Path, text: str) -> str | None:
             raise ConfigError(
                 f"{path}: EPSG:{code} gives no metres east and north; write the points in EPSG:4326 or in a "
                 "projected system, such as UTM."
+            )
+        if code in _MERCATOR:
+            raise ConfigError(
+                f"{path}: lengths in EPSG:{code}, a map of the whole Earth, grow with the latitude, so "
+                "that they are no metres; write the points in EPSG:4326 or in UTM."
             )
         return f"EPSG:{code}"
     utm, is_south = _UTM.search(text), "+south" in text

@@ -1,6 +1,6 @@
 """Positions in a scene of control points: by their marks in photographs, or by their names."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 import pycolmap
@@ -10,6 +10,7 @@ from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.dataset.dataset import Dataset
 from octasplat.engine.dataset.image_names import match_image_names
 from octasplat.engine.dataset.images import read_image_info
+from octasplat.engine.dataset.photograph_files import image_folder, photographs_below
 from octasplat.engine.georeference.control_file import ControlFile, ControlPoint, Mark
 
 MIN_ANGLE_RAD = np.deg2rad(0.5)
@@ -25,10 +26,15 @@ class ScenePoints:
         self._dataset, self._control = dataset, control
         self._origin = np.array(dataset.origin_world)
         self._index = {view.name: index for index, view in enumerate(dataset.views)}
+        by_path = {view.image_path: index for index, view in enumerate(dataset.views)}
+        # with those that have no pose: else a name of theirs would be taken for a like one that has
+        self._photographs = {
+            name: by_path.get(path) for name, path in photographs_below(image_folder(dataset.root)).items()
+        }
         self._points = {} if control is None else {point.name: point for point in control.points}
         marked = {mark.photograph for point in self._points.values() for mark in point.marks}
         # without names of points: one that is like a photograph's would leave it open whose it is
-        self._views = match_image_names(marked, self._index.keys())
+        self._marked = self._named_views(marked)
 
     def camera_centres(self) -> Float64[np.ndarray, "n 3"]:
         """Return the positions of all cameras."""
@@ -44,17 +50,17 @@ class ScenePoints:
         assert self._control is not None
         if not point.marks:
             found = self._by_name(point.name)
-            if found is None:
+            if found is None and point.name not in self._named_views([point.name]):
                 raise ConfigError(
                     f"{self._control.path}: {point.name} has no mark in a photograph, and there is no "
-                    "photograph with a pose and no sparse point of that name; mark it in two photographs."
+                    "photograph and no sparse point of that name; mark it in two photographs."
                 )
             return found
         if len({mark.photograph for mark in point.marks}) < 2:
             raise ConfigError(
                 f"{self._control.path}: {point.name} is marked in one photograph; mark it in another, too."
             )
-        marks = [mark for mark in point.marks if mark.photograph in self._views]
+        marks = [mark for mark in point.marks if self._marked.get(mark.photograph) is not None]
         return None if len({mark.photograph for mark in marks}) < 2 else self._triangulate(point.name, marks)
 
     def end_of_length(self, name: str) -> _Position:
@@ -79,19 +85,27 @@ class ScenePoints:
 
     def _by_name(self, name: str) -> _Position | None:
         """Return the position of a photograph's camera or of a sparse point."""
-        view = match_image_names([name], self._index.keys()).get(name)
+        view = self._named_views([name]).get(name)
         if view is not None:
-            return self._dataset.views[self._index[view]].origin_world + self._origin
+            return self._dataset.views[view].origin_world + self._origin
         points = self._dataset.points
         if name.isdecimal() and len(place := np.flatnonzero(points.ids == int(name))):
             return points.xyz_world[place[0]].astype(np.float64) + self._origin
         return None
 
+    def _named_views(self, names: Collection[str]) -> dict[str, int | None]:
+        """Return the views of the names that photographs have; None of those without a pose."""
+        found = match_image_names(names, self._photographs.keys())
+        by_file = {name: self._photographs[file] for name, file in found.items()}
+        return by_file | {name: self._index[name] for name in names if name in self._index}
+
     def _triangulate(self, name: str, marks: Sequence[Mark]) -> _Position:
         assert self._control is not None
         poses, rays, ways = [], [], []
         for mark in marks:
-            view = self._dataset.views[self._index[self._views[mark.photograph]]]
+            index = self._marked[mark.photograph]
+            assert index is not None
+            view = self._dataset.views[index]
             info = read_image_info(view.image_path)
             if not (0 <= mark.x_px <= info.width_px and 0 <= mark.y_px <= info.height_px):
                 raise ConfigError(

@@ -43,6 +43,8 @@ def find_georeference(
     if request.source == "off":
         return None
     points = ScenePoints(dataset, request.control)
+    for path in request.unread:
+        note(f"{path} is not read, since there are others; control_points={path.name} takes it instead.")
     found = None
     if request.source == "auto" and request.control is not None and _has_positions(request.control):
         found = _from_control_points(points, request.control, note)
@@ -111,9 +113,8 @@ def _from_control_points(
             continue
         position = points.control_position(point)
         if position is None:
-            note(
-                f"{control.path}: {point.name} is left out, as fewer than two of its photographs have poses."
-            )
+            few = "fewer than two of its photographs have poses" if point.marks else "it has no pose"
+            note(f"{control.path}: {point.name} is left out, as {few}.")
             continue
         names.append(point.name)
         scene.append(position)

@@ -40,11 +40,13 @@ class GeoreferenceRequest:
             nothing.
         control: ground control points; None without any.
         length: a known length; None without one.
+        unread: further files of control points, of which nobody has named one.
     """
 
     source: GeoreferenceSource = "auto"
     control: ControlFile | None = None
     length: KnownLength | None = None
+    unread: tuple[Path, ...] = ()
 
 
 def read_request(
@@ -66,7 +68,7 @@ def read_request(
         if control_points or known_length:
             raise ConfigError("`georeference` is off; leave `control_points` and `known_length` out.")
         return GeoreferenceRequest(source)
-    control = None
+    control, there = None, list[Path]()
     if control_points is not None:
         try:
             control = read_control_file(scene / check_relative_path(control_points))
@@ -79,7 +81,8 @@ def read_request(
         control = read_control_file(there[0]) if there else None
     if control is not None:
         _check_photographs(control, scene)
-    return GeoreferenceRequest(source, control, None if known_length is None else parse_length(known_length))
+    length = None if known_length is None else parse_length(known_length)
+    return GeoreferenceRequest(source, control, length, tuple(there[1:]))
 
 
 def parse_length(text: str) -> KnownLength:

@@ -140,12 +140,12 @@ def run(
     pixels = sum(model.views[index].width_px * model.views[index].height_px for index in trained.tolist())
     count = asked.count or fewest_blocks(config.train, len(trained), pixels, asked.most_gaussians)
     blocks = plan_from_points(model, trained, count)
+    cores = request.cores or threads or available_threads()
+    costs = _costs(model, blocks, config, asked.most_gaussians, cores)  # which may refuse the settings
     files: tuple[Path, ...] = ()
     if request.picture is not None:
         write_png(request.picture, draw_block_map(model, [block.core for block in blocks]).image_srgb)
         files = (request.picture,)
-    cores = request.cores or threads or available_threads()
-    costs = _costs(model, blocks, config, asked.most_gaussians, cores)
     return PlanResult(files=files, photographs=len(trained), cores=cores, **costs)
 
 

@@ -88,8 +88,15 @@ class TrainBlock:
 
 
 def count_blocks(run: ReconstructionRun) -> int:
-    """Return the number of blocks of a run whose photographs are open; 1 trains the scene as a whole."""
-    return 1 if run.blocks is None else run.blocks.resolve(run.config, run.dataset)
+    """Return the number of blocks of a run whose photographs are open; 1 trains the scene as a whole.
+
+    A run that is planned has those of its plan, whatever the version that goes on with it would make of it.
+    """
+    if run.blocks is None:
+        return 1
+    if has_plan(run.output / BLOCKS):
+        return len(load_plan(run.output / BLOCKS).blocks)
+    return run.blocks.resolve(run.config, run.dataset)
 
 
 def train_all_blocks(run: ReconstructionRun, count: int) -> BlockScene:

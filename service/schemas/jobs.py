@@ -239,13 +239,16 @@ class BlockView(BaseModel):
             root: the whole.
         """
         number = int(row.options["number"])
-        names = ("id", "state", "attempt", "step", "total_steps", "seconds_left", "error")
+        names = ["id", "state", "attempt", "error"]
+        steps = ("step", "total_steps", "seconds_left")
+        if row.stage == "train":  # else they would be photographs that it reads
+            names += steps
         position = ((root.preview or {}).get("block_positions") or {}).get(str(number))
         return cls(
             number=number,
             name=f"block {number}",
             map_position=position,
-            **{name: getattr(row, name) for name in names},
+            **{**dict.fromkeys(steps), **{name: getattr(row, name) for name in names}},
         )
 
 

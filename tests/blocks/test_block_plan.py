@@ -10,21 +10,30 @@ import pytest
 from click.testing import CliRunner
 
 from octasplat.__main__ import cli
+from octasplat.engine.blocks import piece_settings
 from octasplat.engine.blocks.block_map import SIDE_PX, draw_block_map
+from octasplat.engine.blocks.block_plan import Block
+from octasplat.engine.blocks.partition import Box
 from octasplat.engine.blocks.piece_settings import (
     block_settings,
     fewest_blocks,
     finish_settings,
     polish_settings,
 )
+from octasplat.engine.blocks.scene_plan import ScenePlan, save_plan
 from octasplat.engine.blocks.sparse_plan import plan_from_points
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.dataset import load_dataset_model
+from octasplat.engine.core.events import ignore_events
+from octasplat.engine.dataset import SparsePoints, load_dataset_model
 from octasplat.engine.dataset.image_sizes import ImageSizes
+from octasplat.engine.dataset.view_tiles import Rectangles
 from octasplat.engine.operations.block_cost import BlockShare, estimate_blocks, estimate_with_blocks
 from octasplat.engine.operations.block_options import BlockOptions, parse_memory
 from octasplat.engine.operations.cost_model import estimate_reconstruction, gaussians_within
 from octasplat.engine.operations.plan import PlanRequest, run
+from octasplat.engine.pipeline import BlockRequest
+from octasplat.engine.pipeline.block_steps import count_blocks
+from octasplat.engine.pipeline.run import ReconstructionRun
 from octasplat.engine.runs.config import resolve_config
 from octasplat.engine.train.config import TrainConfig
 from tests.support.tiny_dataset import make_tiny_dataset
@@ -74,6 +83,53 @@ def test_map_has_a_color_at_the_middle_of_each_block(scene: Path) -> None:
         found, counts = np.unique(near[near.min(axis=1) < 0.9], axis=0, return_counts=True)
         colors.append(tuple(found[counts.argmax()]))
     assert len(set(colors)) == 4
+
+
+def test_planned_run_has_the_blocks_of_its_plan(scene: Path, tmp_path: Path) -> None:
+    """Also where a later version would make another number of blocks of the same photographs."""
+    found = plan_from_points(load_dataset_model(scene), np.arange(12), 3)
+    none = Rectangles(np.zeros(0, np.int64), *np.zeros((2, 0, 2), np.int64))
+    blocks = tuple(Block(block.core, np.zeros(3), block.share, none) for block in found)
+    (tmp_path / "blocks").mkdir()
+    save_plan(ScenePlan(blocks, (0, 0, 0), 10, 10, None, True), tmp_path / "blocks")
+    planned = ReconstructionRun(
+        scene, tmp_path, resolve_config("standard"), 1, ignore_events, lambda: False, blocks=BlockRequest()
+    )
+    assert count_blocks(planned) == 3
+
+
+EAST, NORTH, UP = np.eye(3)
+
+
+@pytest.mark.parametrize(
+    "world", [[EAST, NORTH, UP], [EAST, -UP, NORTH], [NORTH, UP, EAST], [UP, EAST, NORTH]]
+)
+@pytest.mark.parametrize(("other", "viewer"), [(NORTH, UP), (UP, -NORTH)])
+def test_map_is_seen_from_above_or_as_by_the_cameras(
+    scene: Path, world: Any, other: np.ndarray, viewer: np.ndarray
+) -> None:
+    """Ground, or a wall seen from the south, in worlds whose axes are these."""
+    turn, model = np.array(world), load_dataset_model(scene)
+    middles = np.stack([0 * EAST, 3 * EAST, 2 * other]) @ turn.T
+    places = np.concatenate(
+        [middle + np.random.default_rng(0).normal(0, 0.02, (20, 3)) for middle in middles]
+    )
+    points = SparsePoints(
+        places.astype(np.float32), np.zeros((60, 3), np.float32), np.ones(60, np.int32),
+        np.zeros(60, np.float32), np.arange(60),
+    )  # fmt: skip
+    rotation = np.stack([EAST, -UP, NORTH]) @ turn.T
+    position = turn @ (5 * viewer + EAST)
+    views = tuple(
+        replace(view, rotation_cam_from_world=rotation, translation_cam_from_world=-rotation @ position)
+        for view in model.views
+    )
+    drawn = draw_block_map(
+        replace(model, points=points, views=views), [Box(middle - 1, middle + 1) for middle in middles]
+    )
+    east, above = drawn.middles[1:] - drawn.middles[0]
+    assert east[0] * above[1] - east[1] * above[0] < -0.01  # counterclockwise, where y is down
+    assert other is NORTH or (east[0] > 0.1 and above[1] < -0.1)
 
 
 def test_number_of_blocks_grows_with_photographs_and_with_gaussians_that_do_not_fit() -> None:
@@ -144,6 +200,15 @@ def test_what_cannot_be_planned_is_refused_in_a_sentence(
 ) -> None:
     with pytest.raises(ConfigError, match=sentence):
         run(PlanRequest(source=scene, **options))
+
+
+def test_refused_plan_leaves_no_picture(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of an automatic number it shows late whether there are several blocks."""
+    monkeypatch.setattr(piece_settings, "AUTO_VIEWS", 5)
+    picture = tmp_path / "map.png"
+    with pytest.raises(ConfigError, match="materials"):
+        run(PlanRequest(source=scene, blocks="auto", materials=True, picture=picture))
+    assert not picture.exists()
 
 
 def test_command_prints_the_plan(scene: Path) -> None:

@@ -1,5 +1,7 @@
 """The georeference by ground control points and known lengths, and files that say nonsense."""
 
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -56,10 +58,15 @@ def csv_text(scene: Path, ground: np.ndarray | None, head: str) -> str:
 
 
 def find(
-    scene: Path, tmp_path: Path, file: str | None = None, length: str | None = None, source: str = "auto"
+    scene: Path,
+    tmp_path: Path,
+    file: str | None = None,
+    length: str | None = None,
+    source: str = "auto",
+    note: Callable[[str], None] = lambda _text: None,
 ) -> Georeference | None:
     request = read_request(scene, source, file, length)
-    return find_georeference(open_scene(scene, tmp_path / "cache"), request, lambda _text: None)
+    return find_georeference(open_scene(scene, tmp_path / "cache"), request, note)
 
 
 @pytest.mark.parametrize("code", ["EPSG:4549", "EPSG:4647"])
@@ -138,12 +145,37 @@ def test_degrees_and_cameras_by_name(scene, tmp_path):
     assert found.residuals.rmse_m < 1e-4
 
 
-def test_switched_control_point_is_left_out(scene, tmp_path):
+def test_photographs_without_a_pose_are_not_taken_for_others_of_their_name(scene, tmp_path):
+    centres = camera_centres(scene)
+    unposed, wrong = scene / "images" / "later", 1000.0
+    unposed.mkdir()
+    for name in centres:
+        shutil.copy(scene / "images" / name, unposed / name)
+    ground = apply(truth_matrix(), np.stack(list(centres.values()))).tolist()
+    rows = [f"{name},{x!r},{y!r},{z!r}" for name, (x, y, z) in zip(centres, ground, strict=True)][:4]
+    rows += [f"later/{name},{wrong},{wrong},{wrong}" for name in list(centres)[4:7]]
+    # marks of one point of the scene in photographs of which one has no pose
+    (first, *_), (second, x, y), *_ = sightings(scene, POINTS[0])
+    rows += [f"gcp,{wrong},0,0,later/{first},10,10", f"gcp,{wrong},0,0,{second},{x},{y}"]
+    (scene / "targets.csv").write_text("\n".join(["name,x,y,z,photograph,px,py", *rows]))
+    notes: list[str] = []
+    found = find(scene, tmp_path, "targets.csv", note=notes.append)
+    assert found.residuals.given == found.residuals.used == 4 and found.residuals.rmse_m < 1e-6
+    assert f"later/{list(centres)[4]} is left out, as it has no pose." in notes[0]
+    assert "gcp is left out, as fewer than two of its photographs have poses." in notes[3]
+    with pytest.raises(ConfigError, match=f"known_length: later/{first} is no"):
+        find(scene, tmp_path, None, f"later/{first} {second} 2")
+
+
+def test_switched_control_point_and_a_second_file_are_left_out_with_a_word(scene, tmp_path):
     ground = apply(truth_matrix(), POINTS)
     ground[4] += (6.0, 0.0, 0.0)
     (scene / "gcp_list.txt").write_text(gcp_list(scene, ground, "EPSG:32632"))
-    found = find(scene, tmp_path)
+    (scene / "control_points.csv").write_text("name,x,y,z")
+    notes: list[str] = []
+    found = find(scene, tmp_path, note=notes.append)
     assert found.residuals.left_out == ("gcp4",)
+    assert notes[0].startswith(f"{scene / 'control_points.csv'} is not read") and len(notes) == 2
     assert found.metres_per_unit == pytest.approx(SCALE, rel=1e-6)
 
 
@@ -180,6 +212,7 @@ def test_known_length_corrects_the_scale_of_gps(scene, tmp_path):
         ("EPSG:32632\n1 2 3 10 10", "line 2: has 5 values"),
         ("EPSG:32632\n1 2 3 10 10 nothing.png a", "line 2: there is no photograph nothing.png"),
         ("EPSG:4258\n1 2 3 10 10 NAME a", "EPSG:4258 gives no metres"),
+        ("EPSG:3857\n1 2 3 10 10 NAME a", "lengths in EPSG:3857, a map of the whole Earth, grow"),
         ("somewhere\n1 2 3 10 10 NAME a", "coordinate system 'somewhere' is not known"),
         ("WGS84 UTM 61N\n1 2 3 10 10 NAME a", "coordinate system 'WGS84 UTM 61N' is not known"),
         ("+proj=utm +zone=0\n1 2 3 10 10 NAME a", "coordinate system .*zone=0' is not known"),

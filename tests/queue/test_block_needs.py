@@ -217,6 +217,23 @@ async def test_results_lost_twice_fail_with_the_name_of_the_block(conninfo: str,
             assert [block.state for block in await children(pool, root.id)] == ["succeeded", "queued"]
 
 
+async def test_whole_that_cannot_be_merged_does_not_begin_anew_for_ever(conninfo: str, folder: Path) -> None:
+    async with open_pool(conninfo, max_size=6) as pool:
+        root = await start(pool, folder, await claimed(pool))
+        for block in await children(pool, root.id):
+            await (await claimed(pool, block)).succeed([], job_queue=SLIPS)
+        for _ in range(2):
+            # planned again with all blocks there: once for a lost checkpoint, but no third merge
+            root = await start(pool, folder, await claimed(pool, await fetched(pool, root.id)))
+            root = await settle(pool, root.id)
+        assert root.state == "failed" and root.error is not None
+        assert "Retry the job from the start" in root.error["message"]
+        async with pool.connection() as connection:
+            await retry_job(connection, SLIPS, root.id, from_start=False)
+        root = await start(pool, folder, await claimed(pool, await fetched(pool, root.id)))
+        assert (await settle(pool, root.id)).state == "queued"
+
+
 async def test_cancelling_by_a_front_end_of_the_last_version_is_settled(conninfo: str, folder: Path) -> None:
     """Which changes the state of a job that runs, and leaves the rest to its worker."""
     async with open_pool(conninfo, max_size=6) as pool:

@@ -84,6 +84,10 @@ async def test_progress_and_time_left_are_of_all_blocks(connect_service: Connect
         tag = (await http.get(f"/v1/jobs/{job['id']}")).headers["ETag"]
         long, short = view["blocks"]
         attempt = await claim_job(service, long)
+        await attempt.set_progress(stage="load", step=12, total_steps=15, seconds_left=1.0)
+        loading = await read(http, job)  # photographs that were read are no iterations
+        assert (loading["step"], loading["seconds_left"]) == (5, None)
+        assert loading["blocks"][0]["state"] == "running" and loading["blocks"][0]["step"] is None
         await attempt.set_progress(stage="train", step=10, total_steps=20, seconds_left=30.0)
         seen = await http.get(f"/v1/jobs/{job['id']}", headers={"If-None-Match": tag})
         assert seen.status_code == 200
@@ -101,6 +105,12 @@ async def test_progress_and_time_left_are_of_all_blocks(connect_service: Connect
         told = {event["kind"]: event["data"] for event in timeline}
         assert told["blocks_queued"] == {"blocks": 2, "done": 0}
         assert told["block_finished"] == {"block": 1, "left": 1}
+        await other.succeed([], job_queue=service.job_queue)
+        queued = await read(http, job)
+        await claim_job(service, job)
+        for view in (queued, await read(http, job)):  # the merge begins where the blocks have ended
+            assert (view["stage"], view["step"], view["total_steps"]) == ("train", 35, 40)
+            assert view["progress"] > seen.json()["progress"]
 
 
 async def test_job_is_one_start_and_its_time_is_that_of_the_whole(connect_service: ConnectService) -> None:

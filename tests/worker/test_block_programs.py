@@ -11,14 +11,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from octasplat.engine.blocks.scene_plan import load_plan
+from octasplat.engine.blocks.block_plan import Block
+from octasplat.engine.blocks.partition import Box
+from octasplat.engine.blocks.scene_plan import ScenePlan, load_plan, save_plan
 from octasplat.engine.core.events import CheckpointWritten, Event
+from octasplat.engine.dataset.view_tiles import Rectangles
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
+from octasplat.engine.operations.block_options import block_request
+from octasplat.engine.operations.photograph_sizes import photograph_sizes
 from octasplat.engine.pipeline import BlockRequest, reconstruct
+from octasplat.engine.pipeline.block_request import keep_request
 from octasplat.engine.train.loop.checkpoint import load_best
 from octasplat.workers.db.rows import DatasetFile, Job
 from octasplat.workers.storage.local import LocalStorage
 from octasplat.workers.storage.trees import TreeFile
+from octasplat.workers.worker import reconstruct_handler
 from octasplat.workers.worker.checkpoint import Checkpoint, plan_digest
 from octasplat.workers.worker.job_inputs import JobInputs, fetch_photographs
 from octasplat.workers.worker.job_kinds import get_job_kind
@@ -83,6 +90,29 @@ def run_task(
     events: list[Event] = []
     program(Task(workspace.folder, options, scene=scene, title="tiny", threads=1, progress=events.append))
     return events, workspace
+
+
+def test_merge_goes_on_where_memory_is_reckoned_otherwise_than_when_it_was_planned(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    complete = get_job_kind("reconstruct").resolve({**REQUESTED, "blocks": "auto", "memory": "8G"})
+    assert isinstance(complete, ReconstructJobConfig)
+    most = block_request(complete, complete.run_config(), photograph_sizes(scene)).most_gaussians
+    for name, kept in (("same", most), ("other", most + 1000)):
+        task = Task(tmp_path / name, complete.model_dump(mode="json"), scene=scene)
+        (task.run / "blocks").mkdir(parents=True)
+        keep_request(task.run, BlockRequest(most_gaussians=kept), is_new=True)
+        nothing = Rectangles(np.zeros(0, np.int64), *np.zeros((2, 0, 2), np.int64))
+        block = Block(Box(np.full(3, -np.inf), np.full(3, np.inf)), np.zeros(3), 1.0, nothing)
+        save_plan(ScenePlan((block,), (0,), 10, 10, kept, True), task.run / "blocks")
+        taken = []
+
+        def merge(_scene: Path, output: Path, *_: Any, blocks: BlockRequest | None, **_more: Any) -> None:
+            taken.append(keep_request(output, blocks, is_new=False))  # noqa: B023
+
+        monkeypatch.setattr(reconstruct_handler, "reconstruct_scene", merge)
+        run_whole(task)
+        assert taken == [BlockRequest(most_gaussians=kept)]
 
 
 @pytest.mark.exhaustive

@@ -138,3 +138,16 @@ def test_sentences_of_earlier_attempts_name_no_folder(tmp_path: Path) -> None:
                 f"{noted}/job {source} was trained on views; {noted}/run/scene.ply is large"
             )
             assert told == f"job {source} was trained on views; scene.ply is large"
+
+
+def test_trained_scene_is_stored_with_the_light_that_it_is_measured_by(tmp_path: Path) -> None:
+    workspace = make_workspace(tmp_path)
+    workspace.open()
+    run = workspace.folder / RUN_FOLDER
+    (run / "checkpoints").mkdir(parents=True)
+    names = {"scene.ply", "training.json", "background.exr", "environment.exr", "environment.hdr"}
+    for name in (*names, "checkpoints/best.npz", "mesh.ply"):
+        (run / name).write_bytes(name.encode())
+    stored = workspace.store_checkpoint("evaluate", 0)
+    assert stored is not None and {file.path for file in stored.files} == {f"run/{name}" for name in names}
+    workspace.close()

@@ -20,7 +20,7 @@ from octasplat.workers.db.errors import ConflictError, NotFoundError
 from octasplat.workers.db.events_and_logs import add_event, add_log_lines
 from octasplat.workers.db.live_scenes import get_shown_scene
 from octasplat.workers.db.postgres_text import as_json
-from octasplat.workers.db.rows import Job
+from octasplat.workers.db.rows import TERMINAL, Job
 from octasplat.workers.queue.job_endings import end_job
 from octasplat.workers.queue.job_results import replace_artifacts
 from octasplat.workers.queue.jobs import NewJob, create_jobs, get_job, lock_blocks, requeue_job
@@ -98,6 +98,13 @@ async def start_blocks(
         needed.append(known.id)
     new = [_job_of_block(root, kind, block) for block in ordered if block.number not in kept]
     needed += await create_jobs(connection, job_queue, new)
+    if not needed and await _has_begun_to_merge_anew(connection, root):
+        message = (
+            "Two attempts could not go on with what all blocks have made, and a third would end so, too; "
+            "the warnings in the log say why. Retry the job from the start."
+        )
+        await end_job(connection, root, "failed", {"type": CheckpointError.error_type, "message": message})
+        return
     await connection.execute(
         "INSERT INTO job_needs (job_id, needs_id) SELECT %s, unnest(%s::uuid[]) ON CONFLICT DO NOTHING",
         [root.id, needed],
@@ -112,6 +119,25 @@ async def start_blocks(
     )
     data = {"blocks": len(blocks), "done": sum(child.state == "succeeded" for child in kept.values())}
     await add_event(connection, root.id, root.attempt, "blocks_queued", data)
+
+
+async def _has_begun_to_merge_anew(connection: Connection, root: Job) -> bool:
+    """Return whether a job has planned blocks before that were all trained, since it was last accepted.
+
+    That happens once where its checkpoint is lost, and again and again where the results cannot be merged.
+    """
+    cursor = await connection.execute(
+        """
+        SELECT id FROM job_events
+        WHERE job_id = %(job)s AND attempt > %(fresh)s AND kind = 'blocks_queued'
+          AND data->'done' = data->'blocks' AND id > coalesce((
+            SELECT max(id) FROM job_events
+            WHERE job_id = %(job)s AND kind = 'state' AND data->>'state' = ANY(%(over)s)), 0)
+        LIMIT 1
+        """,
+        {"job": root.id, "fresh": root.fresh_after, "over": list(TERMINAL)},
+    )
+    return await cursor.fetchone() is not None
 
 
 async def release_needs(connection: Connection, job_queue: JobQueue | None, child: Job) -> None:
@@ -248,7 +274,10 @@ async def drop_lost_blocks(connection: Connection, root: Job, lost: Collection[s
             [root.id, root.fresh_after, message],
         )
         if await cursor.fetchone() is not None:
-            raise BlobNotFoundError(f"The results of block {number} are gone from the store once more.")
+            raise BlobNotFoundError(
+                f"The results of block {number} are gone from the store once more; see to the store, and "
+                "retry the job from the start."
+            )
         error = {"type": BlobNotFoundError.error_type, "message": message}
         await replace_artifacts(connection, child, [])
         await connection.execute(
@@ -326,8 +355,15 @@ async def _give_up(connection: Connection, root: Job, ended: Sequence[Job], coun
 
 async def _continue_root(connection: Connection, job_queue: JobQueue, root: Job) -> None:
     """Queue a job whose blocks are done; its next attempt is a part of the same start."""
+    # Its own steps were those before the blocks; it is as far as they all are from now on.
     await connection.execute(
-        "UPDATE jobs SET continuations = continuations || %s WHERE id = %s", [[root.attempt + 1], root.id]
+        """
+        UPDATE jobs SET continuations = continuations || %(next)s,
+            step = least(total_steps, coalesce(step, 0) + (
+                SELECT coalesce(sum((options->>'iterations')::int), 0) FROM jobs WHERE root_id = %(id)s))
+        WHERE id = %(id)s
+        """,
+        {"next": [root.attempt + 1], "id": root.id},
     )
     await requeue_job(connection, job_queue, root)
 

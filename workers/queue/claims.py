@@ -17,13 +17,17 @@ async def claim(pool: Pool, job_id: uuid.UUID, entry_id: int, worker: str) -> At
         job = await get_job(connection, job_id, lock=True)
         if job is None or job.state != "queued" or job.slip != entry_id:
             return None
+        # What goes on with what blocks have made stays as far as they are while photographs are fetched.
         await connection.execute(
             """
-            UPDATE jobs SET state = 'running', attempt = attempt + 1, worker = %s, started_at = now(),
-                heartbeat_at = now(), stage = NULL, step = NULL, total_steps = NULL
-            WHERE id = %s
+            UPDATE jobs SET state = 'running', attempt = attempt + 1, worker = %(worker)s, started_at = now(),
+                heartbeat_at = now(),
+                stage = CASE WHEN attempt + 1 = ANY(continuations) THEN stage END,
+                step = CASE WHEN attempt + 1 = ANY(continuations) THEN step END,
+                total_steps = CASE WHEN attempt + 1 = ANY(continuations) THEN total_steps END
+            WHERE id = %(id)s
             """,
-            [worker, job_id],
+            {"worker": worker, "id": job_id},
         )
         # The order of turns in fair_share; not now(), which is the time at which the transaction began.
         await connection.execute(

@@ -218,7 +218,8 @@ def _run_reconstruction(task: Task) -> None:
                 ),
                 should_stop=task.should_stop,
                 on_step=show_step,
-                blocks=blocks,
+                # those that it was planned with, though this version may reckon memory otherwise
+                blocks=None if has_plan(task.run / BLOCKS) else blocks,
                 start_from=task.begins_with,
             )
     finally:

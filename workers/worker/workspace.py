@@ -55,6 +55,7 @@ _CHECKPOINT = re.compile(r"run/checkpoints/iteration_\d+\.npz")
 _CHECKPOINT_FILES = (
     "run/config.json", "run/held_out.json", "run/views.json", "run/events.jsonl", "run/training.json",
     "run/plan.json", "run/georeference.json", "run/scene.ply", "run/checkpoints/best.npz",
+    "run/background.exr", "run/environment.exr", "run/environment.hdr",
     "run/start/best.npz", "run/start/views.json", START_RECORD,
 )  # fmt: skip
 _SEARCH_FILES = tuple(
