@@ -16,6 +16,8 @@ from octasplat.engine.dataset.synthetic.synthetic_views import SyntheticView, di
 _POSITION_NOISE = 1e-4
 # A point is seen if its ray ends this close to it, as a share of the distance.
 _VISIBILITY_TOLERANCE = 1 - 5e-4
+# A feature is recognised in views from up to so many times as far as the nearest one that shows it.
+_MAX_DISTANCE_RATIO = 4.0
 _BATCH = 4096
 _MAX_BATCHES = 400
 
@@ -59,6 +61,7 @@ def sample_surface_points(
     places: list[np.ndarray] = []
     colors: list[np.ndarray] = []
     tracks: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    centres = np.array([view.centre_world for view in views])
     found = 0
     for _ in range(_MAX_BATCHES):
         chosen = np.sort(random.integers(len(views), size=_BATCH))
@@ -67,6 +70,7 @@ def sample_surface_points(
             scene, camera, [views[k] for k in chosen], pixels, config.objects_only
         )
         observed = np.stack([_project_unoccluded(scene, camera, view, xyz) for view in views], axis=1)
+        observed[_is_too_far(xyz, centres, np.isfinite(observed[..., 0]))] = np.nan
         good = np.sum(np.isfinite(observed[..., 0]), axis=1) >= 2
         # The batch is sorted by view; a shuffle keeps a cut at the wanted number fair to all views.
         order = random.permutation(np.flatnonzero(good))[: config.points - found]
@@ -78,13 +82,21 @@ def sample_surface_points(
         if found == config.points:
             break
     xyz = np.concatenate(places)
-    centres = np.array([view.centre_world for view in views])
     extent = float(np.linalg.norm(np.ptp(centres, axis=0)))
     return SurfacePoints(
         xyz + random.normal(0, _POSITION_NOISE * extent, xyz.shape),
         np.concatenate(colors),
         *(np.concatenate(parts) for parts in zip(*tracks, strict=True)),
     )
+
+
+def _is_too_far(
+    xyz: Float[np.ndarray, "n 3"], centres: Float[np.ndarray, "views 3"], is_seen: Bool[np.ndarray, "n views"]
+) -> Bool[np.ndarray, "n views"]:
+    """Return from which centres a point is too small to be known for that of the nearest one that sees it."""
+    distances = np.stack([np.linalg.norm(xyz - centre, axis=1) for centre in centres], axis=1)
+    nearest = np.min(distances, axis=1, where=is_seen, initial=np.inf, keepdims=True)
+    return np.asarray(distances > _MAX_DISTANCE_RATIO * nearest)
 
 
 def _points_under_pixels(
