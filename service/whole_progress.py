@@ -6,6 +6,11 @@ from typing import Any
 
 from octasplat.workers.db.rows import Job
 
+MAX_PACE = 4.0
+"""So much slower or faster than estimated stages to come may be; the end of a stage says little of them."""
+_UNEVEN_STAGES = ("matches",)
+"""Stages of which most steps take no time, as those of pairs that are not alike: their share says nothing."""
+
 
 @dataclass(frozen=True)
 class WholeProgress:
@@ -24,7 +29,7 @@ def whole_progress(job: Job, stages: Sequence[str]) -> WholeProgress:
     """Return how far a job is, with the estimated time of each stage as its weight.
 
     Without such an estimate all stages count alike, and the time left is known in the last one only. Stages
-    to come are taken to be as much slower or faster than estimated as the present one.
+    to come are taken to be as much slower or faster than estimated as the present one, within ``MAX_PACE``.
 
     Args:
         job: the job.
@@ -45,7 +50,11 @@ def whole_progress(job: Job, stages: Sequence[str]) -> WholeProgress:
     seconds = job.seconds_left
     if seconds is not None and later:
         left_here = (1 - share) * weights[job.stage]
-        seconds = seconds + later * seconds / left_here if estimated and left_here > 0 else None
+        if not estimated or left_here <= 0:
+            seconds = None
+        else:
+            pace = 1.0 if job.stage in _UNEVEN_STAGES else seconds / left_here
+            seconds += later * min(max(pace, 1 / MAX_PACE), MAX_PACE)
     return WholeProgress(
         round(done / sum(weights.values()), 4), None if seconds is None else round(seconds, 1)
     )

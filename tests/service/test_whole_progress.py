@@ -32,3 +32,28 @@ def test_stages_are_weighed_by_estimated_times(
     )
     found = whole_progress(job, ["load", "train"])
     assert (found.share, found.seconds_left) == (share, seconds_left)
+
+
+@pytest.mark.parametrize(
+    ("stage", "step", "seconds_left", "whole_left"),
+    [
+        ("features", 50, 10.0, 10.0 + 2.0 * 500.0),  # half as fast as estimated
+        ("features", 99, 2.0, 2.0 + 4.0 * 500.0),  # 20 times as slow: a noise of the last step
+        ("features", 50, 0.1, 0.1 + 0.25 * 500.0),
+        ("matches", 97, 585.0, 585.0 + 400.0),  # what the quick look has ruled out took no time
+    ],
+)
+def test_stages_to_come_are_as_slow_as_this_one_within_reason(
+    stage: str, step: int, seconds_left: float, whole_left: float
+) -> None:
+    job: Any = SimpleNamespace(
+        state="running",
+        is_over=False,
+        stage=stage,
+        step=step,
+        total_steps=100,
+        seconds_left=seconds_left,
+        estimate={"stage_seconds": {"features": 10.0, "matches": 100.0, "train": 400.0}},
+    )
+    found = whole_progress(job, ["features", "matches", "train"])
+    assert found.seconds_left == pytest.approx(whole_left)
