@@ -78,9 +78,8 @@ def run(
     with phase("simplify", progress, max(excess, 0)):
         try:
             simplified = simplify(gaussians, request.count, on_round, folder)
-        except (
-            DiskFullError
-        ):  # files spare memory, and the result may be much smaller than what is on the way
+        except DiskFullError:
+            # files spare memory, and the result may be much smaller than what is on the way
             simplified = simplify(gaussians, request.count, on_round)
     stop_if(should_stop)
     record = scene_io.describe_edit(

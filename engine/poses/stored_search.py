@@ -47,8 +47,6 @@ def store_stopped_search(work: Path) -> Path | None:
     if not database.exists():
         return None
     try:
-        with closing(sqlite3.connect(database)) as source:  # what was written last may be in another file
-            source.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         return _link(database)
     except (OSError, sqlite3.Error):
         return None  # a convenience: the search is begun again
@@ -125,6 +123,8 @@ def _copy(database: Path) -> Path:
 
 
 def _link(database: Path) -> Path:
+    with closing(sqlite3.connect(database)) as source:  # what was written last may be in another file
+        source.execute("PRAGMA wal_checkpoint(TRUNCATE)")
     stored = database.with_name(STORED_DATABASE)
     stored.unlink(missing_ok=True)
     os.link(database, stored)
