@@ -10,6 +10,7 @@ from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping
 from dataclasses import dataclass, field
 from typing import BinaryIO
 
+from octasplat.engine.core.portable_names import quoted_name
 from octasplat.service.intake.archive import (
     ArchiveFile,
     ArchiveLimits,
@@ -22,7 +23,7 @@ from octasplat.service.intake.faults import IntakeError, IntakeFault
 from octasplat.service.intake.images import ImageHeader, ImageLimits
 from octasplat.service.intake.spool import SpoolSpace
 from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
-from octasplat.workers.storage.errors import ContentTooLargeError
+from octasplat.workers.storage.errors import BlobNotFoundError, ContentTooLargeError, StorageUnavailableError
 from octasplat.workers.storage.os_errors import translate_os_errors
 from octasplat.workers.storage.protocol import Blob, BlobWriter, Storage
 from octasplat.workers.storage.verifying_writer import VerifyingWriter
@@ -258,8 +259,7 @@ async def receive_file(
         ThreadPurpose.UPLOADS, storage.open_writer, sha256=sha256, size_bytes=size_bytes, max_bytes=most
     )
     blob = await receive_body(stream, writer, limits)
-    header = await run_in_pool(ThreadPurpose.UPLOADS, check, storage, path, blob.sha256, limits.dataset.image)
-    return ReceivedFile(path, blob, header_facts(header))
+    return await run_in_pool(ThreadPurpose.UPLOADS, _checked_file, check, storage, path, blob, limits)
 
 
 async def receive_archive(
@@ -324,6 +324,25 @@ def header_facts(header: ImageHeader | None) -> dict[str, str | int | None]:
     return facts if header.warning is None else {**facts, "warning": header.warning}
 
 
+def _checked_file(
+    check: ContentCheck, storage: Storage, path: str, blob: Blob, limits: UploadLimits
+) -> ReceivedFile:
+    """Check content that was just stored.
+
+    Raises:
+        StorageUnavailableError: it is gone: the same content had been stored before, and its removal
+            as unused was under way.
+        Exception: as by ``check``.
+    """
+    try:
+        header = check(storage, path, blob.sha256, limits.dataset.image)
+    except BlobNotFoundError as error:
+        raise StorageUnavailableError(
+            f"The content of {quoted_name(path)} was removed as unused at that moment; send it again."
+        ) from error
+    return ReceivedFile(path, blob, header_facts(header))
+
+
 def _unpack_archive(
     storage: Storage, file: BinaryIO, limits: UploadLimits, max_bytes: int | None
 ) -> tuple[tuple[ReceivedFile, ...], ArchiveListing]:
@@ -339,8 +358,7 @@ def _unpack_archive(
         return storage.open_writer(size_bytes=entry.size_bytes, max_bytes=limits.max_file_bytes)
 
     def on_file(entry: ArchiveFile, blob: Blob) -> None:
-        header = check_file_content(storage, entry.name, blob.sha256, limits.dataset.image)
-        files.append(ReceivedFile(entry.name, blob, header_facts(header)))
+        files.append(_checked_file(check_file_content, storage, entry.name, blob, limits))
 
     unpack_archive(file, listing, begin, on_file)
     return tuple(files), listing

@@ -5,6 +5,7 @@ import hashlib
 import threading
 import time
 from pathlib import Path
+from typing import BinaryIO
 
 import httpx
 import pytest
@@ -163,8 +164,9 @@ async def test_storage_lease_protects_contents_until_expired(
                     pass
 
 
+@pytest.mark.parametrize("ends", ["before the content is checked", "after the content is checked"])
 async def test_content_stored_during_removal_is_kept(
-    conninfo: str, tmp_path: Path, sharp: None, s3_address: str, s3_bucket: str
+    conninfo: str, tmp_path: Path, sharp: None, s3_address: str, s3_bucket: str, ends: str
 ) -> None:
     """A bucket removes what was looked at a moment before; whoever stores it in that moment hears of it."""
     content = picture(2000, "a")
@@ -176,6 +178,7 @@ async def test_content_stored_during_removal_is_kept(
             writer.commit()
         await asyncio.sleep(1.1)  # the times of a bucket are whole seconds
         loop, looked, go_on = asyncio.get_running_loop(), asyncio.Event(), threading.Event()
+        at_check = asyncio.Event()
         client = service.storage.client  # type: ignore[attr-defined]
         delete = client.delete_object
 
@@ -185,13 +188,25 @@ async def test_content_stored_during_removal_is_kept(
             return delete(**given)
 
         client.delete_object = slowly
+        stored, check, opened = service.storage, threading.Event(), service.storage.open
+
+        def open_late(sha256: str) -> BinaryIO:
+            loop.call_soon_threadsafe(at_check.set)
+            assert check.wait(PATIENCE_SECONDS)
+            return opened(sha256)
+
+        stored.open = open_late  # type: ignore[method-assign]
         removing = asyncio.create_task(collect_garbage_now(service.pool, service.storage, every_seconds=0.0))
         await looked.wait()
         address = f"{await new_dataset(http)}/files/images/a.png"
         put = asyncio.create_task(http.put(address, content=content))
-        await asyncio.sleep(0.3)
+        await at_check.wait()
+        if ends == "after the content is checked":
+            check.set()
+            await asyncio.sleep(0.3)
         go_on.set()
         assert (removed := await removing) is not None and removed.blobs == 1
+        check.set()
         answer = await put
         while answer.status_code == 503:
             assert "Retry-After" in answer.headers
