@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+from octasplat.engine.pipeline.block_request import BlockRequest, keep_request
 from octasplat.engine.poses.stored_search import STORED_DATABASE, STORED_SEARCH_FILES
 from octasplat.workers.db.rows import Job
 from octasplat.workers.storage.local import LocalStorage
@@ -54,6 +55,21 @@ def test_state_of_a_search_is_restored_until_poses_are_there(tmp_path: Path) -> 
     assert found is not None and [file.path for file in found.files] == ["run/poses/images.bin"]
     for workspace in (first, second, again):
         workspace.close()
+
+
+def test_state_of_a_search_for_blocks_is_stored(tmp_path: Path) -> None:
+    workspace = Workspace(tmp_path / "work", make_job(1), LocalStorage(tmp_path / "store", floor_bytes=0))
+    workspace.open()
+    keep_request(workspace.folder / "run", BlockRequest(), is_new=True)
+    work = workspace.folder / SEARCH
+    work.mkdir()
+    for name in STORED_SEARCH_FILES:
+        (work / name).write_text("{}")
+    stored = workspace.store_checkpoint("matches", 7)
+    assert stored is not None and {file.path for file in stored.files} == {
+        "run/blocks/request.json", *(f"{SEARCH}/{name}" for name in STORED_SEARCH_FILES)
+    }  # fmt: skip
+    workspace.close()
 
 
 def test_states_of_a_search_come_before_its_poses() -> None:

@@ -356,9 +356,9 @@ class Workspace:
         newest = max((name for name in checkpoints if _CHECKPOINT.fullmatch(name)), default=None)
         if newest is not None:
             return [*names, newest]
-        if poses or pieces:
-            return names
-        return [*names, *search] if any(name.endswith(STORED_DATABASE) for name in search) else []
+        if not poses and any(name.endswith(STORED_DATABASE) for name in search):
+            return [*names, *search]
+        return names if poses or pieces else []
 
 
 def _piece_files(folder: UntrustedFolder, own_block: str | None) -> Iterator[str]:
