@@ -34,6 +34,9 @@ PRESELECTION_MATCHES = 12
 """By which two photographs are alike."""
 RETRY_BELOW_SHARE = 0.9
 """Share of placed photographs below which a large set, too, is searched a second time."""
+SEPARATE_PARTS_FROM = 100
+"""Photographs of a capture from which on those of all its models count as placed. It may show several places
+that nothing links, and a search that took so long is not repeated or given up for that."""
 MAX_REPROJECTION_PX = 2.5
 """Mean error above which the result is not trusted."""
 MIN_POINTS = 100
@@ -78,7 +81,11 @@ class PosesConfig(Settings):
         "for frames of a video.",
     )
     min_share: Annotated[float, Unit("share of photographs"), ADVANCED] = Field(
-        0.5, gt=0, le=1, description="Share of the photographs that must get a pose; fewer are refused."
+        0.5,
+        gt=0,
+        le=1,
+        description="Share of the photographs that must get a pose; fewer are refused. Where there are 100 "
+        "or more, a pose in any of the models counts.",
     )
     first_witnesses: Annotated[int, Unit("photographs"), ADVANCED] = Field(
         24,

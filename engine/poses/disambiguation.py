@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from octasplat.engine.poses.ambiguous_structure import count_pair_inliers, find_false_pairs, remove_pairs
+from octasplat.engine.poses.config import SEPARATE_PARTS_FROM
 from octasplat.engine.poses.gps_contradictions import (
     GroundPositions,
     find_gps_contradictions,
@@ -43,10 +44,12 @@ class MappedModels:
     left_out_pairs: int = 0
     gps_error_m: float | None = None
 
-    @property
-    def placed(self) -> int:
-        """Return how many photographs have poses, if they are unfolded in all models that are kept."""
-        if self.left_out_pairs:
+    def placed(self, photographs: int) -> int:
+        """Return how many of so many photographs have poses.
+
+        In a large capture, and where they were unfolded, those of all models count that are kept.
+        """
+        if self.left_out_pairs or photographs >= SEPARATE_PARTS_FROM:
             return len(_placed(self.models))
         return best_rank(self.models)[0]
 

@@ -109,7 +109,7 @@ class PoseSearch:
         """
         count, config = len(self._names), self._config
         mapped = self._search(thorough=False)
-        placed = best_rank(mapped.models)[0]
+        placed = mapped.placed(count)
         if placed < count and (count <= config.exhaustive_up_to or placed < RETRY_BELOW_SHARE * count):
             self._progress(
                 Warned(
@@ -365,7 +365,7 @@ class PoseSearch:
 
     def _search_rank(self, mapped: MappedModels) -> tuple[bool, int, int]:
         """Return the sort key of searches: models that GPS contradicts come last, then as models do."""
-        is_enough = mapped.placed >= self._config.min_share * len(self._names)
+        is_enough = mapped.placed(len(self._names)) >= self._config.min_share * len(self._names)
         return is_enough and mapped.gps_error_m is None, *best_rank(mapped.models)
 
     def _check_models(self, mapped: MappedModels) -> None:
@@ -381,7 +381,7 @@ class PoseSearch:
         advice = (
             "take more photographs with more overlap, of things that stand still, or send a COLMAP model."
         )
-        if mapped.placed < max(MIN_PHOTOGRAPHS, config.min_share * count):
+        if mapped.placed(count) < max(MIN_PHOTOGRAPHS, config.min_share * count):
             raise DatasetError(
                 f"Only {posed} of {count} photographs could be placed{describe_parts(models, names)}; "
                 f"{advice}"

@@ -178,6 +178,12 @@ def test_false_pairs_are_those_of_the_two_walks(street: Street) -> None:
         assert len(find_gps_contradictions(right, street.database, ground_m).pairs) == 0
 
 
+def test_photographs_of_all_models_count_in_large_captures(street: Street) -> None:
+    mapped = MappedModels(street.parts)
+    assert mapped.placed(99) == street.parts[0].num_reg_images() < 2 * WALK
+    assert mapped.placed(100) == 2 * WALK
+
+
 @pytest.mark.parametrize("comes_to", ["whole", "parts", "folded", "half"])
 def test_models_that_agree_better_with_gps_are_taken(street: Street, tmp_path: Path, comes_to: str) -> None:
     database = copied(street, tmp_path)
@@ -192,7 +198,7 @@ def test_models_that_agree_better_with_gps_are_taken(street: Street, tmp_path: P
     )
     sentences = " ".join(describe_gps_contradictions(mapped))
     if comes_to in ("whole", "parts"):
-        assert mapped.models is again and mapped.placed == 2 * WALK and mapped.gps_error_m is None
+        assert mapped.models is again and mapped.placed(2 * WALK) == 2 * WALK and mapped.gps_error_m is None
         assert sentences == (
             f"The model was folded: {mapped.left_out_pairs} false pairs of photographs that contradict their "
             "GPS were left out."
