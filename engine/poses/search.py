@@ -36,6 +36,7 @@ from octasplat.engine.poses.features import (
     preselect_pairs,
 )
 from octasplat.engine.poses.found_models import write_other_models
+from octasplat.engine.poses.global_mapping import map_globally
 from octasplat.engine.poses.gps_contradictions import GroundPositions, read_ground_positions
 from octasplat.engine.poses.incremental_mapping import best_rank, map_photographs, model_rank
 from octasplat.engine.poses.linking_pairs import NEIGHBORS_BY_NAME, propose_links
@@ -277,12 +278,19 @@ class PoseSearch:
         allow_weak_links: bool = False,
         start: Path | None = None,
     ) -> list[Any]:
+        count = len(self._names)
+        if self._config.is_large(count) and start is None:
+            models = map_globally(database, seed=self._config.seed)
+            placed = MappedModels(models).placed(count)
+            if placed >= RETRY_BELOW_SHARE * count and is_trustworthy(models[0]):
+                at(best_rank(models)[0])
+                return models
         return map_photographs(
             database,
             self._photographs,
             seed=self._config.seed,
             on_count=at,
-            is_large=self._config.is_large(len(self._names)),
+            is_large=self._config.is_large(count),
             allow_weak_links=allow_weak_links,
             start=start,
         )
