@@ -1,0 +1,97 @@
+"""What is told of a process in which COLMAP works."""
+
+import json
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import IO, Any
+
+import pytest
+
+from octasplat.engine.core.events import Event, PhaseFinished, PhaseStarted, Warned
+from octasplat.engine.poses import find_poses as module
+from octasplat.engine.poses.config import (
+    FOUND_FOLDER,
+    RECORD_FILE,
+    GivenModel,
+    PoseSearchRequest,
+)
+
+
+def lines_of(*events: Event) -> bytes:
+    lines = [json.dumps(event.as_dict()) for event in events]
+    return "\n".join([*lines, json.dumps({"kind": "done"}), ""]).encode()
+
+
+def fake_process(monkeypatch: pytest.MonkeyPatch, record: dict[str, Any], *events: Event) -> None:
+    """Let a process that tells these events leave a model with that record."""
+
+    @contextmanager
+    def start(request: PoseSearchRequest, _stderr_log: IO[bytes]) -> Iterator[Any]:
+        (request.work / FOUND_FOLDER).mkdir()
+        (request.work / FOUND_FOLDER / RECORD_FILE).write_text(json.dumps(record))
+        read, write = os.pipe()
+        os.write(write, lines_of(*events))
+        os.close(write)
+        with os.fdopen(read, "rb") as stdout:
+            yield SimpleNamespace(stdout=stdout, wait=lambda: 0)
+
+    monkeypatch.setattr(module, "_start_process", start)
+
+
+def find(images: Path, output: Path, progress: Callable[[Event], None]) -> None:
+    module.find_poses(images, output, names=["a.png"], progress=progress)
+
+
+def repair(images: Path, output: Path, progress: Callable[[Event], None]) -> None:
+    given = GivenModel(model=images, names=("a.png",), doubtful=(0,))
+    module.repair_poses(images, ["a.png"], given, output, progress=progress)
+
+
+def adjust(images: Path, output: Path, progress: Callable[[Event], None]) -> None:
+    module.adjust_principal_points(images, output, progress=progress)
+
+
+@pytest.mark.parametrize(
+    ("last", "record", "work"),
+    [
+        ("poses", {"placed": 1}, find),
+        ("placing", {"moved": ["a.png"]}, repair),
+        ("lenses", {"lenses": {"reprojection_px": 1.0}}, adjust),
+    ],
+)
+def test_last_stage_ends_when_the_model_is_in_its_place(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    last: str,
+    record: dict[str, Any],
+    work: Callable[[Path, Path, Callable[[Event], None]], None],
+) -> None:
+    (tmp_path / "a.png").write_bytes(b"a photograph")
+    told = [
+        PhaseStarted("features", 1), PhaseFinished("features", 1.0),
+        PhaseStarted(last, 1), PhaseFinished(last, 1.0), Warned("One is left out."),
+    ]  # fmt: skip
+    fake_process(monkeypatch, record, *told)
+    output, heard = tmp_path / "poses", dict[str, bool]()
+
+    def hear(event: Event) -> None:
+        if isinstance(event, PhaseFinished):
+            heard[event.stage] = (output / RECORD_FILE).exists()
+
+    work(tmp_path, output, hear)
+    assert heard == {"features": False, last: True}
+
+
+def test_first_of_two_searches_ends_before_the_second(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "a.png").write_bytes(b"a photograph")
+    stages = ("poses", "features", "poses")
+    both = [event for name in stages for event in (PhaseStarted(name, 1), PhaseFinished(name, 1.0))]
+    fake_process(monkeypatch, {"placed": 1}, *both)
+    heard = list[Event]()
+    find(tmp_path, tmp_path / "poses", heard.append)
+    assert heard == both
