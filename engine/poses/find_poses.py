@@ -345,9 +345,11 @@ class _ColmapProcess:
     def _forward_event(self, event: Event) -> None:
         if isinstance(event, PhaseStarted):
             self.stage, self.step = event.stage, 0
-        self._last_progress = event if isinstance(event, PhaseProgress) else None
-        if self._last_progress is not None:
-            self.step = self._last_progress.step
+            self._last_progress = PhaseProgress(event.stage, 0, event.total_steps)
+        elif isinstance(event, PhaseProgress):
+            self.step, self._last_progress = event.step, event
+        elif isinstance(event, PhaseFinished):
+            self._last_progress = None
         self._last_event_time = time.monotonic()
         self._progress(event)
 

@@ -10,9 +10,11 @@ from typing import IO, Any
 
 import pytest
 
-from octasplat.engine.core.events import Event, PhaseFinished, PhaseStarted, Warned
+from octasplat.engine.core.errors import CancelledError
+from octasplat.engine.core.events import Event, PhaseFinished, PhaseProgress, PhaseStarted, Warned
 from octasplat.engine.poses import find_poses as module
 from octasplat.engine.poses.config import (
+    DEFAULT_CONFIG,
     FOUND_FOLDER,
     RECORD_FILE,
     GivenModel,
@@ -95,3 +97,27 @@ def test_first_of_two_searches_ends_before_the_second(
     heard = list[Event]()
     find(tmp_path, tmp_path / "poses", heard.append)
     assert heard == both
+
+
+@pytest.mark.parametrize(
+    ("told", "repeated"),
+    [
+        ([PhaseStarted("poses", 9)], PhaseProgress("poses", 0, 9)),
+        ([PhaseProgress("matches", 4, 9), Warned("It rains.")], PhaseProgress("matches", 4, 9)),
+        ([PhaseProgress("poses", 8, 9), PhaseFinished("poses", 1.0)], PhaseProgress("poses", 8, 9)),
+    ],
+)
+def test_long_steps_are_told_to_be_alive_wherever_they_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: list[Event], repeated: Event
+) -> None:
+    monkeypatch.setattr(module, "_HEARTBEAT_SECONDS", -1.0)
+    monkeypatch.setattr(module, "_POLL_SECONDS", 0.0)
+    request = PoseSearchRequest(images=tmp_path, names=(), work=tmp_path, config=DEFAULT_CONFIG, threads=1)
+    asked, heard = iter((False, True)), list[Event]()
+    process = module._ColmapProcess(request, heard.append, lambda: next(asked))
+    for line in lines_of(*told).splitlines()[:-1]:
+        process._handle_line(line)
+    read, write = os.pipe()
+    with os.fdopen(read, "rb"), os.fdopen(write, "wb"), pytest.raises(CancelledError):
+        process._read_chunk(read)
+    assert heard[-1] == repeated
