@@ -382,8 +382,8 @@ def _start_process(request: PoseSearchRequest, stderr_log: IO[bytes]) -> Iterato
 
 def _crash_message(code: int, stage: str, log: Path) -> str:
     placing = "placing photographs" if stage else "starting"
-    known = {"features": "looking for features", "matches": "matching", "lenses": "adjusting lenses"}
-    doing = known.get(stage, placing)
+    known = {"read": "reading photographs", "features": "looking for features", "matches": "matching"}
+    doing = (known | {"lenses": "adjusting lenses"}).get(stage, placing)
     how = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
     text = log.read_text(encoding="utf-8", errors="replace") if log.exists() else ""
     said = next((line.strip()[:300] for line in reversed(text.splitlines()) if line.strip()), "")

@@ -121,3 +121,12 @@ def test_long_steps_are_told_to_be_alive_wherever_they_are(
     with os.fdopen(read, "rb"), os.fdopen(write, "wb"), pytest.raises(CancelledError):
         process._read_chunk(read)
     assert heard[-1] == repeated
+
+
+@pytest.mark.parametrize(
+    ("stage", "doing"),
+    [("", "starting"), ("read", "reading photographs"), ("matches", "matching"), ("poses", "placing photo")],
+)
+def test_crash_names_what_was_done(tmp_path: Path, stage: str, doing: str) -> None:
+    message = module._crash_message(-9, stage, tmp_path / "log.txt")
+    assert message.startswith(f"COLMAP was ended by SIGKILL while {doing}")
