@@ -10,7 +10,7 @@ MAX_PACE = 4.0
 """So much slower or faster than estimated stages to come may be; the end of a stage says little of them."""
 _UNEVEN_STAGES = ("matches",)
 """Stages of which most steps take no time, as those of pairs that are not alike: their share says nothing."""
-_BEFORE_TRAINING = ("check", "features", "matches", "placing", "lenses")
+_BEFORE_TRAINING = ("check", "read", "features", "matches", "placing", "lenses")
 """Stages of poses and lenses in doubt, which nobody expects: all that precedes the training is done then."""
 
 

@@ -71,9 +71,9 @@ def find_poses(
     There are four stages: ``read`` and ``features``, whose steps are photographs, ``matches``, whose steps
     are pairs of them, and ``poses``, whose steps are photographs again, the last one the number of those
     placed. Where photographs are left out, the last three may come a second time; a search that goes on has
-    no ``read``. The same photographs give the same files on
-    any number of threads. A result that is there already is taken as it is. A search that was stopped goes
-    on with the features and matches that it had found.
+    no ``read``, but for photographs in formats that COLMAP does not read, which are counted first. The same
+    photographs give the same files on any number of threads. A result that is there already is taken as it
+    is. A search that was stopped goes on with the features and matches that it had found.
 
     Args:
         images: folder of photographs, also in folders below it if it is called ``images``.
