@@ -1,6 +1,7 @@
 """Working folder of a pose search: photographs under other names, and progress of its stages."""
 
 import shutil
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -44,10 +45,22 @@ def link_photographs(
 
 
 def _write_png(photograph: Path, target: Path) -> None:
-    """Write the display colors of a photograph as a PNG of 8 bits."""
+    """Write the display colors of a photograph as a PNG of 8 bits, with its EXIF: focal length and GPS."""
     info = read_image_info(photograph)
     colors, _ = read_photo(photograph, info.width_px, info.height_px, 8)
-    Image.fromarray(colors).save(target, compress_level=1)  # fast: the file is temporary
+    exif = _stored_exif(photograph)
+    Image.fromarray(colors).save(target, compress_level=1, exif=exif)  # fast: the file is temporary
+
+
+def _stored_exif(photograph: Path) -> bytes:
+    """Return the EXIF of a photograph as it is stored; empty where it has none, or has no place for it."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # many pixels, none of which are decoded
+            with Image.open(photograph) as image:
+                return bytes(image.info.get("exif", b""))
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+        return b""
 
 
 @contextmanager
