@@ -10,8 +10,9 @@ from typing import IO, Any
 
 import pytest
 
-from octasplat.engine.core.errors import CancelledError
+from octasplat.engine.core.errors import CancelledError, ColmapCrashError
 from octasplat.engine.core.events import Event, PhaseFinished, PhaseProgress, PhaseStarted, Warned
+from octasplat.engine.pipeline.output_folder import claim_output, release_on_refusal
 from octasplat.engine.poses import find_poses as module
 from octasplat.engine.poses.config import (
     DEFAULT_CONFIG,
@@ -20,6 +21,7 @@ from octasplat.engine.poses.config import (
     GivenModel,
     PoseSearchRequest,
 )
+from octasplat.engine.runs.config import ReconstructionConfig
 
 
 def lines_of(*events: Event) -> bytes:
@@ -130,3 +132,12 @@ def test_long_steps_are_told_to_be_alive_wherever_they_are(
 def test_crash_names_what_was_done(tmp_path: Path, stage: str, doing: str) -> None:
     message = module._crash_message(-9, stage, tmp_path / "log.txt")
     assert message.startswith(f"COLMAP was ended by SIGKILL while {doing}")
+
+
+def test_same_command_goes_after_a_crash(tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    for _ in range(2):
+        is_new = claim_output(tmp_path, output, ReconstructionConfig(), resume=False)
+        with pytest.raises(ColmapCrashError), release_on_refusal(output, is_new=is_new, is_made=True):
+            raise ColmapCrashError("COLMAP died; run the same command again.")
+    assert not output.exists()
