@@ -10,6 +10,8 @@ MAX_PACE = 4.0
 """So much slower or faster than estimated stages to come may be; the end of a stage says little of them."""
 _UNEVEN_STAGES = ("matches",)
 """Stages of which most steps take no time, as those of pairs that are not alike: their share says nothing."""
+_BEFORE_TRAINING = ("check", "read", "features", "matches", "placing", "lenses")
+"""Stages of poses and lenses in doubt, which nobody expects: all that precedes the training is done then."""
 
 
 @dataclass(frozen=True)
@@ -39,10 +41,11 @@ def whole_progress(job: Job, stages: Sequence[str]) -> WholeProgress:
         return WholeProgress(1.0, 0.0)
     if job.is_over or not stages:
         return WholeProgress()
-    if job.stage is None or job.stage not in stages:
-        return WholeProgress(0.0)
     estimated = _stage_seconds(job.estimate, stages)
     weights = estimated or dict.fromkeys(stages, 1.0)
+    if job.stage is None or job.stage not in stages:
+        before = stages.index("train") if job.stage in _BEFORE_TRAINING and "train" in stages else 0
+        return WholeProgress(round(sum(weights[name] for name in stages[:before]) / sum(weights.values()), 4))
     place = stages.index(job.stage)
     share = min(1.0, (job.step or 0) / job.total_steps) if job.total_steps else 0.0
     done = sum(weights[name] for name in stages[:place]) + share * weights[job.stage]

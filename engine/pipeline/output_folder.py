@@ -7,6 +7,7 @@ from pathlib import Path
 
 from octasplat.engine.core.errors import (
     CheckpointError,
+    ColmapCrashError,
     ConfigError,
     DatasetError,
     OutputError,
@@ -63,7 +64,8 @@ def claim_output(scene: Path, output: Path, config: ReconstructionConfig, resume
 def release_on_refusal(output: Path, *, is_new: bool, is_made: bool) -> Iterator[None]:
     """Release the folder of a new run if its photographs or settings are refused, for the corrected command.
 
-    The decoded photographs stay, and poses that were found: the corrected command goes on with them.
+    So it is where COLMAP has crashed, for the same command. The decoded photographs stay, and poses that were
+    found: the next command goes on with them.
 
     Args:
         output: the folder.
@@ -72,7 +74,7 @@ def release_on_refusal(output: Path, *, is_new: bool, is_made: bool) -> Iterator
     """
     try:
         yield
-    except (DatasetError, ConfigError, SceneFileError, CheckpointError):
+    except (DatasetError, ConfigError, SceneFileError, CheckpointError, ColmapCrashError):
         if is_new:
             (output / CONFIG).unlink()
             (output / EVENTS).unlink(missing_ok=True)

@@ -18,6 +18,7 @@ from octasplat.engine.core.events import (
     CheckpointWritten,
     Event,
     EventListener,
+    PhaseFinished,
     PhaseProgress,
     PhaseStarted,
     ignore_events,
@@ -29,7 +30,10 @@ from octasplat.engine.poses.config import (
     DEFAULT_CONFIG,
     FEATURES,
     FOUND_FOLDER,
+    LENSES_STAGE,
+    MAPPING_STAGE,
     MATCHES,
+    PLACING_STAGE,
     RECORD_FILE,
     GivenModel,
     PosesConfig,
@@ -47,6 +51,8 @@ from octasplat.engine.poses.stored_search import (
 _POLL_SECONDS = 0.5
 _HEARTBEAT_SECONDS = 30.0
 """How often a step that takes long tells that it is alive."""
+_LAST_STAGES = (MAPPING_STAGE, PLACING_STAGE, LENSES_STAGE)
+"""Stages whose end says that the result is there: told once it is, as others store or show it then."""
 _SINGLE_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -65,9 +71,9 @@ def find_poses(
     There are four stages: ``read`` and ``features``, whose steps are photographs, ``matches``, whose steps
     are pairs of them, and ``poses``, whose steps are photographs again, the last one the number of those
     placed. Where photographs are left out, the last three may come a second time; a search that goes on has
-    no ``read``. The same photographs give the same files on
-    any number of threads. A result that is there already is taken as it is. A search that was stopped goes
-    on with the features and matches that it had found.
+    no ``read``, but for photographs in formats that COLMAP does not read, which are counted first. The same
+    photographs give the same files on any number of threads. A result that is there already is taken as it
+    is. A search that was stopped goes on with the features and matches that it had found.
 
     Args:
         images: folder of photographs, also in folders below it if it is called ``images``.
@@ -113,6 +119,7 @@ def find_poses(
         record = read_pose_record(work / FOUND_FOLDER)
         write_json(work / FOUND_FOLDER / RECORD_FILE, {**record, "photographs_sha256": sha256})
         (work / FOUND_FOLDER).rename(output)  # in one step: the folder is whole or is not there
+        process.tell_end()
 
 
 def repair_poses(
@@ -159,10 +166,12 @@ def repair_poses(
             threads=threads,
             given=given.model_copy(update={"model": given.model.resolve()}),
         )
-        _ColmapProcess(request, progress, should_stop).wait()
+        process = _ColmapProcess(request, progress, should_stop)
+        process.wait()
         moved = tuple(read_pose_record(work / FOUND_FOLDER)["moved"])
         if moved:
             (work / FOUND_FOLDER).rename(output)
+        process.tell_end()
     return moved
 
 
@@ -206,7 +215,8 @@ def adjust_principal_points(
             threads=1,
             lenses_of=model.resolve(),
         )
-        _ColmapProcess(request, progress, should_stop).wait()
+        process = _ColmapProcess(request, progress, should_stop)
+        process.wait()
         facts: dict[str, float] | None = read_pose_record(work / FOUND_FOLDER)["lenses"]
         if facts is not None:
             write_json(work / FOUND_FOLDER / RECORD_FILE, {**before, "lenses": facts})
@@ -214,6 +224,7 @@ def adjust_principal_points(
             if output.is_dir():  # the former model moves into the folder for the work, which is removed
                 output.rename(work / "before")
             (work / FOUND_FOLDER).rename(output)
+        process.tell_end()
     return facts
 
 
@@ -268,6 +279,7 @@ class _ColmapProcess:
         self._should_stop = should_stop
         self.stage, self.step = "", 0
         self._last_progress: Event | None = None
+        self._end: Event | None = None
         self._last_event_time = time.monotonic()
         self._error: str | None = None
         self._is_done = False
@@ -294,6 +306,12 @@ class _ColmapProcess:
         if not self._is_done:
             raise ColmapCrashError(_crash_message(code, self.stage, log))
 
+    def tell_end(self) -> None:
+        """Tell of the end of the last stage, once its result is where it belongs."""
+        end, self._end = self._end, None
+        if end is not None:
+            self._forward_event(end)
+
     def _read_chunk(self, pipe: int) -> bytes:
         """Return the next bytes from the process; empty at its end."""
         while True:
@@ -317,14 +335,21 @@ class _ColmapProcess:
         elif kind == "error":
             self._error = content["message"]
         elif (event := parse_event(kind, content)) is not None:
-            self._forward_event(event)
+            if isinstance(event, PhaseStarted):
+                self.tell_end()
+            if isinstance(event, PhaseFinished) and event.stage in _LAST_STAGES:
+                self._end = event  # what was found is still to be written
+            else:
+                self._forward_event(event)
 
     def _forward_event(self, event: Event) -> None:
         if isinstance(event, PhaseStarted):
             self.stage, self.step = event.stage, 0
-        self._last_progress = event if isinstance(event, PhaseProgress) else None
-        if self._last_progress is not None:
-            self.step = self._last_progress.step
+            self._last_progress = PhaseProgress(event.stage, 0, event.total_steps)
+        elif isinstance(event, PhaseProgress):
+            self.step, self._last_progress = event.step, event
+        elif isinstance(event, PhaseFinished):
+            self._last_progress = None
         self._last_event_time = time.monotonic()
         self._progress(event)
 
@@ -357,8 +382,8 @@ def _start_process(request: PoseSearchRequest, stderr_log: IO[bytes]) -> Iterato
 
 def _crash_message(code: int, stage: str, log: Path) -> str:
     placing = "placing photographs" if stage else "starting"
-    known = {"features": "looking for features", "matches": "matching", "lenses": "adjusting lenses"}
-    doing = known.get(stage, placing)
+    known = {"read": "reading photographs", "features": "looking for features", "matches": "matching"}
+    doing = (known | {"lenses": "adjusting lenses"}).get(stage, placing)
     how = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
     text = log.read_text(encoding="utf-8", errors="replace") if log.exists() else ""
     said = next((line.strip()[:300] for line in reversed(text.splitlines()) if line.strip()), "")

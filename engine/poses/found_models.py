@@ -82,7 +82,7 @@ def describe_other_models(poses: Path) -> str | None:
     if not others:
         return None
     each = [
-        f"{model.folder} of {model.placed} photographs, {len(model.names)} of them not in the first "
+        f"{model.folder} of {model.placed} photographs, {len(model.names)} of them not in that one "
         f"({name_list(model.names)})"
         for model in others[:_MAX_DESCRIBED]
     ]

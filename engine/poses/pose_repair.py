@@ -84,7 +84,7 @@ class _PoseVerifier:
         self._config, self._tell, self._threads = request.config, progress, request.threads or -1
         self._doubtful = frozenset(given.doubtful)
         self._photographs, self._database = request.work / "photographs", request.work / "database.db"
-        self._aliases = link_photographs(request.images, request.names, self._photographs)
+        self._aliases = link_photographs(request.images, request.names, self._photographs, progress)
         infos = [read_image_info(request.images / name) for name in request.names]
         self._sizes_px = [(info.width_px, info.height_px) for info in infos]
         self._one_camera = len(set(self._sizes_px)) == 1

@@ -93,7 +93,7 @@ class PoseSearch:
         self._progress = progress
         adopt_stored_database(work)
         self._photographs = work / "photographs"
-        self._aliases = link_photographs(images, self._names, self._photographs)
+        self._aliases = link_photographs(images, self._names, self._photographs, progress)
         pycolmap.logging.minloglevel = 2  # its warnings are of use to nobody here
         self._drop_unreadable()
         self._one_camera = self._has_one_size()

@@ -22,7 +22,7 @@ def test_larger_place_is_trained_and_the_other_one_can_be(octasplat, tmp_path, t
         )
         assert done.exit_code == 0, done.stderr
         other = output / "poses" / "1"
-        sentence = f"{other} of 5 photographs, 5 of them not in the first (b00.png, b01.png, b02.png, ...)"
+        sentence = f"{other} of 5 photographs, 5 of them not in that one (b00.png, b01.png, b02.png, ...)"
         assert sentence in done.stderr and sentence in done.stdout
         events = (output / "events.jsonl").read_text().splitlines()
         assert sentence in json.dumps([json.loads(line) for line in events])

@@ -84,7 +84,7 @@ def test_other_models_are_named_with_what_the_taken_one_lacks(tmp_path: Path) ->
     assert told is not None
     assert "3 models" in told and "that of 4 photographs is taken" in told
     first = tmp_path / "poses" / "1"
-    assert f"{first} of 4 photographs, 3 of them not in the first (4.jpg, 5.jpg, 6.jpg)" in told
+    assert f"{first} of 4 photographs, 3 of them not in that one (4.jpg, 5.jpg, 6.jpg)" in told
     assert f"--model {first}" in told
     assert read_pose_record(tmp_path / "poses")["other_models"] == [
         {"folder": "1", "placed": 4, "not_in_taken": NAMES[4:7]},
@@ -111,6 +111,8 @@ def test_another_model_is_taken_and_the_first_again(tmp_path: Path) -> None:
     record = read_pose_record(poses)
     assert (record["number"], record["placed"], record["photographs_sha256"]) == (2, 3, "known")
     assert record["other_models"][0] == {"folder": "0", "placed": 4, "not_in_taken": NAMES[:4]}
+    told = describe_other_models(poses)
+    assert told is not None and "that of 3 photographs is taken" in told and "in the first" not in told
     assert [path.name for path in tmp_path.iterdir()] == ["poses"]
     choose_found_model(poses, 0)
     after = {path.relative_to(poses): path.read_bytes() for path in poses.rglob("*.bin")}

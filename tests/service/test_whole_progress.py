@@ -57,3 +57,29 @@ def test_stages_to_come_are_as_slow_as_this_one_within_reason(
     )
     found = whole_progress(job, ["features", "matches", "train"])
     assert found.seconds_left == pytest.approx(whole_left)
+
+
+@pytest.mark.parametrize(
+    ("stage", "stages", "share"),
+    [
+        ("lenses", ["poses", "load", "train"], 0.75),  # of poses that were found
+        ("check", ["load", "train"], 1 / 3),  # of given ones
+        ("features", ["load", "train"], 1 / 3),
+        (None, ["load", "train"], 0.0),
+        ("lenses", ["edit"], 0.0),
+    ],
+)
+def test_stages_that_nobody_expects_come_before_the_training(
+    stage: str | None, stages: list[str], share: float
+) -> None:
+    job: Any = SimpleNamespace(
+        state="running",
+        is_over=False,
+        stage=stage,
+        step=1,
+        total_steps=4,
+        seconds_left=5.0,
+        estimate={"stage_seconds": {"poses": 50.0, "load": 10.0, "train": 20.0}},
+    )
+    found = whole_progress(job, stages)
+    assert found.share == pytest.approx(share, abs=1e-4) and found.seconds_left is None

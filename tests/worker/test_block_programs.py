@@ -14,6 +14,7 @@ import pytest
 from octasplat.engine.blocks.block_plan import Block
 from octasplat.engine.blocks.partition import Box
 from octasplat.engine.blocks.scene_plan import ScenePlan, load_plan, save_plan
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.events import CheckpointWritten, Event
 from octasplat.engine.dataset.view_tiles import Rectangles
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
@@ -21,6 +22,8 @@ from octasplat.engine.operations.block_options import block_request
 from octasplat.engine.operations.photograph_sizes import photograph_sizes
 from octasplat.engine.pipeline import BlockRequest, reconstruct
 from octasplat.engine.pipeline.block_request import keep_request
+from octasplat.engine.pipeline.output_folder import claim_output
+from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.train.loop.checkpoint import load_best
 from octasplat.workers.db.rows import DatasetFile, Job
 from octasplat.workers.storage.local import LocalStorage
@@ -207,3 +210,33 @@ def test_programs_hand_over_what_makes_the_bytes_of_one_process(scene: Path, tmp
     assert kept is not None and not any(file.path.endswith(".npz") for file in kept.files)
     for workspace in (first, last):
         workspace.close()
+
+
+@pytest.mark.parametrize(
+    ("record", "kept"),
+    [
+        ({"photographs_sha256": "a"}, [".poses.work/stored.db", "poses/images.bin", "poses/poses.json"]),
+        ({"photographs_sha256": "a", "lenses": {}}, [".poses.work/stored.db"]),
+        ({"moved": ["a.png"]}, [".poses.work/stored.db"]),
+    ],
+)
+def test_job_that_begins_anew_keeps_what_its_search_has_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record: dict[str, Any], kept: list[str]
+) -> None:
+    task = Task(folder=tmp_path, options=REQUESTED)
+    for name in ("config.json", "blocks/request.json", ".poses.work/stored.db", "poses/images.bin"):
+        (task.run / name).parent.mkdir(parents=True, exist_ok=True)
+        (task.run / name).write_text("{}")
+    (task.run / "poses" / "poses.json").write_text(json.dumps(record))
+    found = list[list[str]]()
+
+    def refuse_what_was_there(task: Task) -> None:
+        files = (path for path in task.run.rglob("*") if path.is_file())
+        found.append(sorted(path.relative_to(task.run).as_posix() for path in files))
+        if len(found) == 1:
+            raise ConfigError("It has other settings.")
+
+    monkeypatch.setattr(reconstruct_handler, "_run_reconstruction", refuse_what_was_there)
+    run_whole(task)
+    assert found[1] == kept
+    claim_output(tmp_path, task.run, ReconstructionConfig(poses="auto"), resume=True)

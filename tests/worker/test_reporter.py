@@ -10,8 +10,10 @@ from typing import Any
 import pytest
 
 from octasplat.workers.db.live_scenes import LiveScene
+from octasplat.workers.db.quotas import QuotaExceededError
 from octasplat.workers.storage.errors import StorageError
 from octasplat.workers.worker import reporter
+from octasplat.workers.worker.checkpoint import Checkpoint
 from octasplat.workers.worker.reporter import Reporter
 
 
@@ -137,6 +139,44 @@ async def test_reporter_says_which_file_was_not_stored(monkeypatch: pytest.Monke
         for what, name in (("preview", "preview.jpg"), ("live scene", "l.ply"))
     ]
     assert workspace.checkpoints == 1
+
+
+async def test_reporter_says_that_the_state_at_the_end_was_not_stored(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Log(SlowJournal):
+        pool = None
+        job = SimpleNamespace(id="j")
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.lines: list[str] = []
+
+        async def add_log_lines(self, lines: tuple[str, ...]) -> None:
+            self.lines += lines
+
+        async def record_checkpoint(self, *_: object, **__: object) -> None:
+            raise QuotaExceededError("bytes", "All bytes are taken.")
+
+    class Workspace:
+        storage = None
+
+        def store_checkpoint(self, stage: str, step: int) -> Checkpoint:
+            return Checkpoint(1, stage, step, ())
+
+    @contextlib.asynccontextmanager
+    async def no_lease(*_: object) -> AsyncIterator[None]:
+        yield None
+
+    monkeypatch.setattr(reporter, "storage_lease", no_lease)
+    journal = Log()
+    child = Reporter(journal, Workspace())  # type: ignore[arg-type]
+    child.on_event({"kind": "stage_started", "stage": "matches", "total_steps": 9})
+    child.on_event({"kind": "checkpoint_written", "iteration": 4, "path": "stored.db"})
+    await child.finish()
+    assert journal.lines[-1] == (
+        "Warning: the state of the search for poses is not kept: All bytes are taken."
+    )
 
 
 async def test_reporter_records_how_many_gaussians_are_of_each_block(monkeypatch: pytest.MonkeyPatch) -> None:

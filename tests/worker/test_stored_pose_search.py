@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+import pytest
+
 from octasplat.engine.pipeline.block_request import BlockRequest, keep_request
 from octasplat.engine.poses.stored_search import STORED_DATABASE, STORED_SEARCH_FILES
 from octasplat.workers.db.rows import Job
@@ -69,6 +71,21 @@ def test_state_of_a_search_for_blocks_is_stored(tmp_path: Path) -> None:
     assert stored is not None and {file.path for file in stored.files} == {
         "run/blocks/request.json", *(f"{SEARCH}/{name}" for name in STORED_SEARCH_FILES)
     }  # fmt: skip
+    workspace.close()
+
+
+@pytest.mark.parametrize("files", [STORED_SEARCH_FILES, ("search.json", "pairs.json")])
+def test_search_that_is_done_twice_keeps_its_state_until_poses_are_there(
+    tmp_path: Path, files: tuple[str, ...]
+) -> None:
+    workspace = Workspace(tmp_path / "work", make_job(2), LocalStorage(tmp_path / "store", floor_bytes=0))
+    workspace.open()
+    keep_request(workspace.folder / "run", BlockRequest(), is_new=True)
+    work = workspace.folder / SEARCH
+    work.mkdir()
+    for name in files:  # an attempt that goes on has made the stored database its own
+        (work / name).write_text("{}")
+    assert workspace.store_checkpoint("poses", 0) is None
     workspace.close()
 
 

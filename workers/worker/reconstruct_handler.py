@@ -1,6 +1,7 @@
 """Programs of the jobs that reconstruct; only such a job's own process imports this."""
 
 import shutil
+from pathlib import Path
 
 from octasplat.engine.blocks.block_map import draw_block_map
 from octasplat.engine.blocks.scene_plan import COARSE, ScenePlan, block_name, has_plan, load_plan
@@ -30,12 +31,15 @@ from octasplat.engine.pipeline import (
     planned_blocks,
 )
 from octasplat.engine.pipeline import reconstruct as reconstruct_scene
+from octasplat.engine.poses.found_models import read_pose_record
+from octasplat.engine.poses.stored_search import search_folder
 from octasplat.engine.render.image_files import write_png
 from octasplat.engine.runs.run_folder import (
     BLOCKS,
     CACHE,
     CHECKPOINTS,
     CONFIG,
+    POSES,
     SCENE,
     START,
     VIEWS,
@@ -71,9 +75,25 @@ def reconstruct(task: Task) -> None:
                 f"What was there cannot be gone on with; retry the job from the start: {message}"
             ) from None
         task.progress(Warned(f"What was there cannot be gone on with, so the job begins anew: {message}"))
-        shutil.rmtree(task.run)
+        _discard_run(task.run)
         shutil.rmtree(task.results)
         _run_reconstruction(task)
+
+
+def _discard_run(run: Path) -> None:
+    """Remove what an earlier attempt left, but for poses that were found and the state of a search for them.
+
+    Either takes hours, depends on no settings of the run, and says itself what photographs it is of.
+    """
+    kept = {search_folder(run / POSES)}
+    record = read_pose_record(run / POSES)
+    if "photographs_sha256" in record and "lenses" not in record:
+        kept.add(run / POSES)
+    for path in run.iterdir():
+        if path.is_dir() and path not in kept:
+            shutil.rmtree(path)
+        elif path not in kept:
+            path.unlink()
 
 
 def train_block(task: Task) -> None:

@@ -169,6 +169,8 @@ class Reporter:
         with contextlib.suppress(*_IGNORED_ERRORS):
             await self._flush()
         await self._store_pending()
+        with contextlib.suppress(*_IGNORED_ERRORS):  # what could not be stored is told, too
+            await self._flush()
 
     async def close(self) -> None:
         """Stop without writing what is pending."""

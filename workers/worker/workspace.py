@@ -356,8 +356,10 @@ class Workspace:
         newest = max((name for name in checkpoints if _CHECKPOINT.fullmatch(name)), default=None)
         if newest is not None:
             return [*names, newest]
-        if not poses and any(name.endswith(STORED_DATABASE) for name in search):
-            return [*names, *search]
+        if search and not poses:
+            # The first of two searches may have ended, whose state an earlier checkpoint has.
+            has_state = stage != "poses" and any(name.endswith(STORED_DATABASE) for name in search)
+            return [*names, *search] if has_state else []
         return names if poses or pieces else []
 
 
