@@ -30,6 +30,8 @@ _PROJECTED_AMONG_DEGREES = frozenset((*range(4491, 4555), 4647))
 """EPSG codes of projected systems in metres, of CGCS2000 and of Germany, among those that give degrees."""
 _MERCATOR = frozenset((3395, 3785, 3857, 54004, 102100, 102113, 900913))
 """EPSG codes, and others used as such, of the whole Earth on one map, with metres at the equator alone."""
+_FEET = frozenset((*range(2222, 2290), *range(3433, 3439)))
+"""EPSG codes of state planes of the USA (NAD83) in feet; those of later datums are not told from metres."""
 _EPSG = re.compile(r"EPSG", re.IGNORECASE)
 _LOCAL = re.compile(r"^local$", re.IGNORECASE)
 _OTHER_SYSTEM = re.compile(r"\bUTM\b|\+proj|\bWGS ?84\b", re.IGNORECASE)
@@ -206,6 +208,11 @@ def _parse_crs(path: Path, text: str) -> str | None:
             raise ConfigError(
                 f"{path}: lengths in EPSG:{code}, a map of the whole Earth, grow with the latitude, so "
                 "that they are no metres; write the points in EPSG:4326 or in UTM."
+            )
+        if code in _FEET:
+            raise ConfigError(
+                f"{path}: EPSG:{code} is in feet; write the points in EPSG:4326, in UTM or in the same system "
+                "in metres."
             )
         return f"EPSG:{code}"
     utm, is_south = _UTM.search(text), "+south" in text

@@ -213,6 +213,7 @@ def test_known_length_corrects_the_scale_of_gps(scene, tmp_path):
         ("EPSG:32632\n1 2 3 10 10 nothing.png a", "line 2: there is no photograph nothing.png"),
         ("EPSG:4258\n1 2 3 10 10 NAME a", "EPSG:4258 gives no metres"),
         ("EPSG:3857\n1 2 3 10 10 NAME a", "lengths in EPSG:3857, a map of the whole Earth, grow"),
+        ("EPSG:2263\n1 2 3 10 10 NAME a", "EPSG:2263 is in feet; write"),
         ("somewhere\n1 2 3 10 10 NAME a", "coordinate system 'somewhere' is not known"),
         ("WGS84 UTM 61N\n1 2 3 10 10 NAME a", "coordinate system 'WGS84 UTM 61N' is not known"),
         ("+proj=utm +zone=0\n1 2 3 10 10 NAME a", "coordinate system .*zone=0' is not known"),
