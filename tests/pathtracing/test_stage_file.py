@@ -103,6 +103,11 @@ def test_stage_file_with_all_keys_is_read(tmp_path: Path) -> None:
         (BALL + 'material = { kind = "diffuse", color = 1 }', r"material\.color; the nearest is color_srgb"),
         (BALL + "positions = [0, 0, 0]", "the nearest is position"),
         (BALL + "scale = .2", r"write 0\.2 for \.2"),
+        (BALL + 'material = "glass"', r"\.material: is a table, such as \{ kind = .* \(it is glass\)"),
+        (BALL + "on = [1, 2]", r"meshes\[0\]\.on: is a table, such as \{ view"),
+        (BALL + "keys = { frame = 1 }", r"\.keys: is a list of tables, such as \[\{ frame = 0"),
+        ("meshes = [7]", r"meshes\[0\]: is a table \(it is 7\)"),
+        ("[[environment]]", r"environment: is one table; write \[environment\] with single brackets"),
     ],
 )
 def test_stage_file_error_names_key(text: str, words: str) -> None:
