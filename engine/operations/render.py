@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from octasplat.engine.core.events import EventListener, Warned, ignore_events
+from octasplat.engine.core.events import EventListener, Noted, Warned, ignore_events
 from octasplat.engine.operations.base import Operation, Result, never_stop
 from octasplat.engine.operations.render_options import (
     UP_OF_RUN_UNUSED,
@@ -30,6 +30,11 @@ PREVIEW_SIDE_PX = 480
 STAGE_LACKS_BACKGROUND = (
     "The background that was learnt is left out on a stage; to show it, and to be lit by it, name the run's "
     "background.exr as the stage's environment."
+)
+STAGE_LACKS_MATERIALS = (
+    "The scene's materials are left out on this stage, and its harmonics shown, which have no sharp "
+    'reflections; light = "relit" of [[gaussians]] shows materials in the light of the stage, such as the '
+    "environment.exr of a run."
 )
 
 
@@ -274,6 +279,7 @@ def _render_plain(plan: _RenderPlan, progress: EventListener, threads: int) -> t
 
 def _render_on_stage(plan: _RenderPlan, progress: EventListener, threads: int) -> tuple[Path, ...]:
     request, source, cameras, shots, output = plan
+    from octasplat.engine.gaussians.materials import has_materials
     from octasplat.engine.operations.render_source import stage_scene
     from octasplat.engine.pathtracing.stage.stage_file import stage_identity
     from octasplat.engine.pathtracing.stage_motion import is_moving
@@ -285,6 +291,9 @@ def _render_on_stage(plan: _RenderPlan, progress: EventListener, threads: int) -
     assert stage is not None
     if source.learnt is not None and request.background is None and stage.environment is None:
         progress(Warned(STAGE_LACKS_BACKGROUND))
+    shown = {part.light for part in stage.gaussians if part.file is None}
+    if has_materials(source.gaussians) and shown - {"relit"}:
+        progress(Noted(STAGE_LACKS_MATERIALS))
     background = background_color(request.background or source.background)
     scene = stage_scene(source, request.stage_folder, background, progress, threads=threads)
     if request.preview:

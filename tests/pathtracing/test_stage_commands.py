@@ -12,7 +12,7 @@ from octasplat.engine.pathtracing.stage.stage_file import read_stage
 from octasplat.engine.render.image_files import read_image
 from octasplat.workers.cli.main import cli
 from tests.support.image_channels import read_channels
-from tests.support.light_scenes import table_with_a_box
+from tests.support.light_scenes import shiny_ball, table_with_a_box
 
 
 def octasplat(*arguments: object) -> Result:
@@ -111,6 +111,17 @@ def test_invalid_stage_is_refused_before_rendering(
     assert done.exit_code == 1 and words in done.output, done.output
     assert done.output.count("Error:") == 1 and "Traceback" not in done.output
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("light", "told"), [("shadowed", True), ("relit", False)])
+def test_stage_without_the_materials_of_its_scene_says_so(tmp_path: Path, light: str, told: bool) -> None:
+    ball = shiny_ball(100, 1.0, albedo=(1, 1, 1), metallic=1.0, roughness=0.2)
+    write_gaussian_ply(ball, tmp_path / "ball.ply")
+    (tmp_path / "stage.toml").write_text(f"[[gaussians]]\nlight = '{light}'\n[integrator]\nsamples = 1\n")
+    one = ("-o", tmp_path, "--turntable", "--frames", 1, "--width", 16, "--height", 16, "--threads", 1)
+    done = octasplat("render", tmp_path / "ball.ply", "--stage", tmp_path / "stage.toml", *one)
+    assert done.exit_code == 0, done.output
+    assert ("materials are left out on this stage" in " ".join(done.output.split())) == told
 
 
 def test_preview_wants_a_stage_and_one_file(scene: Path, tmp_path: Path) -> None:
