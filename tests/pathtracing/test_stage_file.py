@@ -116,6 +116,10 @@ def test_stage_file_with_all_keys_is_read(tmp_path: Path) -> None:
         (BALL + 'material = "glass"', r"\.material: is a table, such as \{ kind = .* \(it is glass\)"),
         (BALL + "on = [1, 2]", r"meshes\[0\]\.on: is a table, such as \{ view"),
         (BALL + "keys = { frame = 1 }", r"\.keys: is a list of tables, such as \[\{ frame = 0"),
+        (
+            "[[meshes]]\nshape = 'plane'\nmaterial = { kind = 'glass' }",
+            r"meshes\[0\]: a plane encloses nothing",
+        ),
         ("meshes = [7]", r"meshes\[0\]: is a table \(it is 7\)"),
         ("[[environment]]", r"environment: is one table; write \[environment\] with single brackets"),
     ],
