@@ -100,7 +100,10 @@ def test_stage_object_rests_on_surface(scene: Path, tmp_path: Path) -> None:
             "[[meshes]]\nshape = 'cube'\non = { origin = [0, -2, 0], direction = [0, -1, 0] }",
             "the ray meets nothing solid",
         ),
-        ("[[meshes]]\nshape = 'cube'\non = { view = 'a.jpg', pixel = [1, 1] }", "has no photographs"),
+        (
+            "[[meshes]]\nshape = 'cube'\non = { view = 'a.jpg', pixel = [1, 1] }",
+            "meshes[0].on: a.jpg: a file of",
+        ),
     ],
 )
 def test_invalid_stage_is_refused_before_rendering(
