@@ -15,7 +15,7 @@ from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.core.writing import atomic_replace, write_text
 from octasplat.engine.files.export_options import ExportOptions
-from octasplat.engine.files.obj_materials import read_mtl
+from octasplat.engine.files.obj_materials import UNKNOWN_RGB_LINEAR, missing_libraries, read_mtl
 from octasplat.engine.files.obj_parser import ObjParts, parse_block, read_blocks, uv_of_vertices
 from octasplat.engine.files.octagon_batches import BATCH_SIZE, OctagonBatch, OctagonSoup
 from octasplat.engine.files.place_comments import place_comments
@@ -107,7 +107,11 @@ def _read_materials(path: Path, parts: ObjParts, count: int) -> dict[str, Any]:
         # Each use holds until the next one.
         for start, name in parts.material_uses:
             numbers[start:] = known[name]
-        missing = MeshMaterial("", unsupported=("no entry in an MTL file",))
+        lost = missing_libraries(path, parts.libraries)
+        why = f"{', '.join(lost)} is not in the folder of the OBJ" if lost else "no MTL file has one"
+        # Colors of vertices are multiplied by that of the material.
+        grey = (1.0, 1.0, 1.0) if "rgb_linear" in looks else UNKNOWN_RGB_LINEAR
+        missing = MeshMaterial("", grey, unsupported=(f"its entry, as {why}",))
         looks["material_indices"] = numbers
         looks["materials"] = tuple(materials.get(name, replace(missing, name=name)) for name in known)
     return looks

@@ -13,6 +13,8 @@ from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.geometry.mesh_material import MeshMaterial, resolve_image
 
 MAX_BYTES = 64 << 20
+UNKNOWN_RGB_LINEAR = (0.6, 0.6, 0.6)
+"""Of a material that states no color, or of which nothing is known."""
 NUMBERS = {"Ns", "Ni", "d", "Tr", "Pr", "Pm", "Pc", "Pcr", "illum"}
 COLORS = {"Kd", "Ke"}
 IMAGES = {
@@ -38,11 +40,9 @@ def read_mtl(obj: Path, names: Sequence[str]) -> dict[str, MeshMaterial]:
         SceneFileError: a file cannot be read, a number is none, or an image is missing.
     """
     materials: dict[str, MeshMaterial] = {}
-    folder = obj.parent.resolve()
     for name in names:
-        path = (folder / name.replace("\\", "/")).resolve()
-        # Nothing outside the folder of the OBJ is read, whatever it names.
-        if not (path.is_relative_to(folder) and path.is_file()):
+        path = _library_path(obj, name)
+        if path is None:
             continue
         try:
             if path.stat().st_size > MAX_BYTES:
@@ -53,6 +53,19 @@ def read_mtl(obj: Path, names: Sequence[str]) -> dict[str, MeshMaterial]:
         for entry in _parse_entries(text):
             materials[entry["newmtl"]] = _parse_material(path, entry)
     return materials
+
+
+def missing_libraries(obj: Path, names: Sequence[str]) -> tuple[str, ...]:
+    """Return those of the MTL files that an OBJ names that :func:`read_mtl` does not find."""
+    return tuple(name for name in names if _library_path(obj, name) is None)
+
+
+def _library_path(obj: Path, name: str) -> Path | None:
+    """Return an MTL file that an OBJ names; None where it is not there."""
+    folder = obj.parent.resolve()
+    path = (folder / name.replace("\\", "/")).resolve()
+    # Nothing outside the folder of the OBJ is read, whatever it names.
+    return path if path.is_relative_to(folder) and path.is_file() else None
 
 
 def _parse_entries(text: str) -> list[dict[str, str]]:
@@ -93,7 +106,7 @@ def _parse_material(path: Path, entry: dict[str, str]) -> MeshMaterial:
     passed_over += [key for key in entry if key not in known]
     return MeshMaterial(
         entry["newmtl"],
-        colors.get("Kd", (0.6, 0.6, 0.6)),
+        colors.get("Kd", UNKNOWN_RGB_LINEAR),
         metallic=min(max(numbers.get("Pm", 0.0), 0.0), 1.0),
         roughness=min(max(numbers.get("Pr", 1.0), 0.0), 1.0),
         emission_linear=colors.get("Ke", (0.0, 0.0, 0.0)),

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from octasplat.engine.core.events import EventListener, Warned, ignore_events
+from octasplat.engine.core.events import EventListener, Noted, Warned, ignore_events
 from octasplat.engine.operations.base import Operation, Result, never_stop
 from octasplat.engine.operations.render_options import (
     UP_OF_RUN_UNUSED,
@@ -30,6 +30,15 @@ PREVIEW_SIDE_PX = 480
 STAGE_LACKS_BACKGROUND = (
     "The background that was learnt is left out on a stage; to show it, and to be lit by it, name the run's "
     "background.exr as the stage's environment."
+)
+STAGE_IS_OPAQUE = (
+    "The environment of the stage is seen behind everything, so that no pixel is transparent; with visible = "
+    "false it lights the scene alone."
+)
+STAGE_LACKS_MATERIALS = (
+    "The scene's materials are left out on this stage, and its harmonics shown, which have no sharp "
+    'reflections; light = "relit" of [[gaussians]] shows materials in the light of the stage, such as the '
+    "environment.exr of a run."
 )
 
 
@@ -91,8 +100,6 @@ class RenderOptions(PictureOptions):
             return self
         if self.shading is not None:
             raise ValueError("`shading` goes without `stage`, in which `light` says how Gaussians are lit")
-        if self.background == "transparent":
-            raise ValueError("a stage is transparent in EXR only, which has alpha on any background")
         if (self.layers or self.stage.integrator.layers) and self.format != "exr":
             raise ValueError("layers are kept by EXR only; choose the format exr")
         if self.preview and self.format == "mp4":
@@ -274,6 +281,7 @@ def _render_plain(plan: _RenderPlan, progress: EventListener, threads: int) -> t
 
 def _render_on_stage(plan: _RenderPlan, progress: EventListener, threads: int) -> tuple[Path, ...]:
     request, source, cameras, shots, output = plan
+    from octasplat.engine.gaussians.materials import has_materials
     from octasplat.engine.operations.render_source import stage_scene
     from octasplat.engine.pathtracing.stage.stage_file import stage_identity
     from octasplat.engine.pathtracing.stage_motion import is_moving
@@ -285,21 +293,29 @@ def _render_on_stage(plan: _RenderPlan, progress: EventListener, threads: int) -
     assert stage is not None
     if source.learnt is not None and request.background is None and stage.environment is None:
         progress(Warned(STAGE_LACKS_BACKGROUND))
-    background = background_color(request.background or source.background)
+    shown = {part.light for part in stage.gaussians if part.file is None}
+    if has_materials(source.gaussians) and shown - {"relit"}:
+        progress(Noted(STAGE_LACKS_MATERIALS))
+    transparent = request.background == "transparent"
+    if transparent and stage.environment is not None and stage.environment.visible:
+        progress(Warned(STAGE_IS_OPAQUE))
+    background = background_color("black" if transparent else request.background or source.background)
     scene = stage_scene(source, request.stage_folder, background, progress, threads=threads)
     if request.preview:
-        compile_stage(stage, scene, shots).preview(shots[0], request.output, progress)
+        renderer = compile_stage(stage, scene, shots, transparent=transparent)
+        renderer.preview(shots[0], request.output, progress)
         return (request.output,)
     views = None if cameras is not None else (source.viewpoints, source.near_world)
     # what decides how images look; the output's place does not
     finished = output.finished_images(
         render_digest(
-            source.gaussians, source.settings, background, False, cameras,
+            source.gaussians, source.settings, background, transparent, cameras,
             stage_identity(stage, request.stage_folder), views, scene.photographs,
             *output.numbered(shots, counts=is_moving(stage) and cameras is None),
         )
     )  # fmt: skip
-    return output.write(shots, compile_stage(stage, scene, shots).render_fn, finished, progress)
+    renderer = compile_stage(stage, scene, shots, transparent=transparent)
+    return output.write(shots, renderer.render_fn, finished, progress)
 
 
 OPERATION = Operation(

@@ -245,7 +245,10 @@ def _add_mesh(
     for chosen, given in materials:
         # only the winding tells which side of glass is inside
         if isinstance(given.material, Glass) and (turned := turn_outwards(shape, chosen)) is not None:
-            warn(f"{name}: {mesh.file} faces inwards; it is turned inside out, as glass needs an outside.")
+            said = (
+                "faces inwards, or parts of it do; what does is turned inside out, as glass needs an outside."
+            )
+            warn(f"{name}: {mesh.file} {said}")
             shape = turned
     turn = up_axis_rotation(mesh_up_axis(mesh), mesh.turn_degrees, up)
     corners = transform_points(shape.vertices, mesh, turn)[shape.faces].astype(np.float32)

@@ -98,15 +98,27 @@ class Film:
             self._shape
         )
 
-    def image(self, *, exposure: float = 0.0, tone: ToneCurve = "none") -> StageImage:
-        """Return the image of all paths so far; ``exposure`` is in stops."""
-        linear = self._linear_radiance()
+    def image(
+        self, *, exposure: float = 0.0, tone: ToneCurve = "none", transparent: bool = False
+    ) -> StageImage:
+        """Return the image of all paths so far.
+
+        Args:
+            exposure: in stops.
+            tone: curve of the display values.
+            transparent: the background is black and stands for nothing: display values are those of what
+                covers it, not multiplied by alpha, and linear values are multiplied by alpha.
+        """
+        linear, alpha = self._linear_radiance(), self._alpha()
+        layers = self._mesh_layers(linear)
+        if transparent:
+            linear = self._linear_radiance(of_covered=True)
         display = linear_to_srgb(apply_tone_curve(linear * 2.0**exposure, tone))
         return StageImage(
             np.clip(display, 0.0, 1.0).astype(np.float32).reshape(*self._shape, 3),
-            self._to_image(linear),
-            self._to_image(self._sums.coverage / np.maximum(self._sums.samples, 1)),
-            self._mesh_layers(linear),
+            self._to_image(alpha[:, None] * linear if transparent else linear),
+            self._to_image(alpha),
+            layers,
         )
 
     def denoised(self, denoise: DenoiseFn) -> "Film":
@@ -132,13 +144,23 @@ class Film:
             film._without_meshes = self._without_meshes.denoised(denoise)
         return film
 
-    def _linear_radiance(self, *, lit: bool = True) -> Float64[np.ndarray, "n 3"]:
-        """Return linear values; without ``lit`` those of the Gaussians as trained."""
+    def _alpha(self) -> Float64[np.ndarray, " n"]:
+        return np.asarray(self._sums.coverage / np.maximum(self._sums.samples, 1))
+
+    def _linear_radiance(self, *, lit: bool = True, of_covered: bool = False) -> Float64[np.ndarray, "n 3"]:
+        """Return linear values; without ``lit`` those of the Gaussians as trained.
+
+        ``of_covered`` gives the values of what covers a black background, as if it did so fully.
+        """
         count = np.maximum(self._sums.samples, 1)[:, None]
         through, front = self._sums.transmittance[:, None] / count, self._sums.front[:, None] / count
         covered = np.maximum(1.0 - through - front, 0.0)
         layer = self._sums.layer_srgb / count
         light = _safe_divide(self._sums.light_linear, self._sums.transmittance[:, None])
+        if of_covered:
+            # all light behind the layer comes from what covers the background
+            through = np.maximum(self._alpha()[:, None] - covered - front, 0.0)
+            light = _safe_divide(self._sums.light_linear / count, through)
         surface = _safe_divide(self._sums.front_linear, self._sums.front[:, None])
         if lit:
             shade = _safe_divide(self._sums.shading, self._covered(), 1.0)
@@ -147,6 +169,8 @@ class Film:
             # an unlit color is not rounded twice
             layer = np.where(np.abs(shade - 1.0) < 1e-6, layer, covered * linear_to_srgb(color))
         display = layer + front * linear_to_srgb(surface) + through * linear_to_srgb(light)
+        if of_covered:
+            display = _safe_divide(display, self._alpha()[:, None])
         return np.asarray(srgb_to_linear(display))
 
     def _covered(self) -> Float64[np.ndarray, "n 1"]:

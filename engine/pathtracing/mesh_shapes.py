@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from octasplat.engine.core.errors import ConfigError
@@ -15,6 +17,10 @@ from octasplat.engine.pathtracing.kernels.smooth_normals import smooth_normals
 from octasplat.engine.pathtracing.stage.base import Transformed
 
 SPHERE_DIVISIONS = 5
+CLOSED_TOLERANCE = 1e-6
+"""Share of the area of a closed solid that is left where the areas of its faces are added as vectors."""
+MAX_SOLIDS = 2000
+"""So many solids of one mesh, the largest ones, are looked at for what lies within others."""
 WELD_TOLERANCE = 1e-6
 """Points nearer than this share of the mesh's size are one, whatever the file says."""
 
@@ -157,31 +163,37 @@ def count_open_edges(shape: MeshShape, face_mask: Bool[np.ndarray, " f"] | None 
 
     Vertices that lie in one place count as one, as in files that repeat them for normals and textures.
     """
-    size = max(float(np.ptp(shape.vertices, axis=0).max()), 1e-30)
-    _, owner = np.unique(
-        np.round(shape.vertices / (WELD_TOLERANCE * size)).astype(np.int64), axis=0, return_inverse=True
+    faces = _welded(shape.vertices)[shape.faces if face_mask is None else shape.faces[face_mask]].astype(
+        np.int32
     )
-    faces = owner.reshape(-1)[shape.faces if face_mask is None else shape.faces[face_mask]].astype(np.int32)
     # faces welded to a line have edges of their own, which are no holes
     sound = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     report = edge_report(faces[sound])
     return report.open_edges + report.non_manifold_edges + report.inconsistent_edges
 
 
+def _welded(vertices: Float64[np.ndarray, "v 3"]) -> Int64[np.ndarray, " v"]:
+    """Return the same number for vertices that lie in one place."""
+    size = max(float(np.ptp(vertices, axis=0).max()), 1e-30)
+    _, owner = np.unique(
+        np.round(vertices / (WELD_TOLERANCE * size)).astype(np.int64), axis=0, return_inverse=True
+    )
+    return owner.reshape(-1)
+
+
 def turn_outwards(shape: MeshShape, face_mask: Bool[np.ndarray, " f"]) -> MeshShape | None:
-    """Return a shape with some closed faces turned inside out; None where they face outwards already.
+    """Return a shape with closed faces that face inwards turned over; None where none do.
 
     Args:
         shape: the triangles.
-        face_mask: the faces, which close one or more solids; what they enclose has a negative volume where
-            they face inwards.
+        face_mask: the faces, which close one or more solids. A solid faces inwards where its volume is
+            negative; what lies within another, such as a bubble, is turned with that alone.
     """
-    faces = shape.faces[face_mask]
-    # far from the origin the sum of volumes would lose its digits
-    points = shape.vertices - shape.vertices.mean(axis=0)
-    a, b, c = points[faces[:, 0]], points[faces[:, 1]], points[faces[:, 2]]
-    if np.einsum("fk,fk->", a, np.cross(b, c)) >= 0:
+    face_mask = face_mask & _faces_inwards(shape, face_mask)
+    if not face_mask.any():
         return None
+    faces = shape.faces[face_mask]
+    a, b, c = shape.vertices[faces[:, 0]], shape.vertices[faces[:, 1]], shape.vertices[faces[:, 2]]
 
     def turned(corners: np.ndarray | None) -> np.ndarray | None:
         if corners is None:
@@ -208,6 +220,44 @@ def turn_outwards(shape: MeshShape, face_mask: Bool[np.ndarray, " f"]) -> MeshSh
         corner_rgb_linear=turned(shape.corner_rgb_linear),
         corner_alpha=turned(shape.corner_alpha),
     )
+
+
+def _faces_inwards(shape: MeshShape, face_mask: Bool[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
+    """Return the faces of solids that face inwards, or that lie within such a one."""
+    faces = shape.faces[face_mask]
+    owner = _welded(shape.vertices)
+    edges = owner[faces[:, [0, 1, 1, 2]]].reshape(-1, 2).T
+    count = int(owner.max()) + 1
+    links = coo_array((np.ones(edges.shape[1], bool), (edges[0], edges[1])), (count, count))
+    _, solids = np.unique(
+        connected_components(links, directed=False)[1][owner[faces[:, 0]]], return_inverse=True
+    )
+    solids = solids.reshape(-1)
+    total = int(solids.max(initial=-1)) + 1
+    # far from the origin the sum of volumes would lose its digits
+    points = shape.vertices - shape.vertices.mean(axis=0)
+    corners = points[faces]
+    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    volumes = np.bincount(solids, np.einsum("fk,fk->f", corners[:, 0], areas), total)
+    inwards = volumes < 0
+    if total > 1:
+        # the areas of what is closed cancel; what is not has no inside
+        left = np.stack([np.bincount(solids, areas[:, axis], total) for axis in range(3)], axis=1)
+        whole = np.bincount(solids, np.linalg.norm(areas, axis=1), total)
+        inwards &= np.linalg.norm(left, axis=1) < CLOSED_TOLERANCE * whole
+        low, high = np.full((total, 3), np.inf), np.full((total, 3), -np.inf)
+        np.minimum.at(low, solids, corners.min(axis=1))
+        np.maximum.at(high, solids, corners.max(axis=1))
+        # the largest first, so that what a solid lies within is known before it
+        order = np.argsort(-(high - low).prod(axis=1), kind="stable")
+        for place, solid in enumerate(order[:MAX_SOLIDS]):
+            larger = order[:place]
+            around = larger[((low[larger] < low[solid]) & (high[solid] < high[larger])).all(axis=1)]
+            if len(around):
+                inwards[solid] = inwards[around[0]]
+    found = np.zeros(len(shape.faces), bool)
+    found[face_mask] = inwards[solids]
+    return found
 
 
 def _sphere_shape() -> MeshShape:

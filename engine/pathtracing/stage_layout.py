@@ -42,7 +42,7 @@ def estimate_stage_layout(
         up_world: up.
         centre_world: of what the cameras look at.
         size: about as large as that, world units.
-        cameras_world: where some of the cameras are.
+        cameras_world: where some of the cameras are, that of a preview first.
     """
     up = up_world / np.linalg.norm(up_world)
     near = np.linalg.norm(gaussians.means_world - centre_world, axis=1) < 1.5 * size
@@ -71,9 +71,11 @@ def estimate_stage_layout(
             return _stage_layout(up, floor, size, light)
         spots = _spots_beside(some.means_world.astype(np.float64), area, up, size)
         visibility = _visibility(tracer, cameras_world, spots + above)
-        nearness = (spots - centre_world) @ (cameras_world.mean(axis=0) - centre_world)
-        # equally visible spots: the one towards the cameras
-        best = np.lexsort((nearness, np.round(visibility, 2)))[-1]
+        # a preview shows what the first camera sees
+        is_seen = _visibility(tracer, cameras_world[:1], spots + above) > 0.9
+        nearness = (spots - centre_world) @ (cameras_world[0] - centre_world)
+        # equally visible spots: the one towards that camera
+        best = np.lexsort((nearness, np.round(visibility, 2), is_seen))[-1]
         return replace(_stage_layout(up, spots[best], size, light), is_beside=True)
     places = centre_world + np.array(HANGING_FRACTIONS)[:, None] * (cameras_world.mean(axis=0) - centre_world)
     visibility = _visibility(tracer, cameras_world, places)

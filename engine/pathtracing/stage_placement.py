@@ -56,7 +56,10 @@ def _resting_point(
 ) -> Float64[np.ndarray, "3"]:
     """Return the point of the Gaussians on which a mesh rests."""
     if rest.view is not None and rest.pixel is not None:
-        origin, direction = ray_of_pixel(rest.view, rest.pixel)
+        try:
+            origin, direction = ray_of_pixel(rest.view, rest.pixel)
+        except ConfigError as error:
+            raise ConfigError(f"{key}: {error}") from None
         what = f"pixel {rest.pixel[0]:g}, {rest.pixel[1]:g} of {rest.view}"
     else:
         origin, direction = np.array(rest.origin), np.array(rest.direction)

@@ -11,7 +11,7 @@ from octasplat.engine.core.events import EventListener
 from octasplat.engine.core.local_origin import is_set
 from octasplat.engine.core.progress import counted_phase
 from octasplat.engine.pathtracing.compile_meshes import CompiledMeshes, check_outside_glass, compile_meshes
-from octasplat.engine.pathtracing.film import StageImage
+from octasplat.engine.pathtracing.film import Film, StageImage
 from octasplat.engine.pathtracing.gaussian_layers import GaussianLayers, build_gaussian_layers
 from octasplat.engine.pathtracing.path_tracer import PathTracer, PathTracerScene
 from octasplat.engine.pathtracing.stage.model import Integrator, Stage
@@ -30,15 +30,17 @@ class StageRenderer:
     Attributes:
         tracer_at: returns the tracer of the stage as it is in a shot.
         settings: how to trace.
+        transparent: images keep alpha in place of the background, which is black.
     """
 
     tracer_at: Callable[[Shot], PathTracer]
     settings: Integrator
+    transparent: bool = False
 
     @property
     def render_fn(self) -> RenderFn:
         """Return the function that renders a shot to a file."""
-        return stage_render_fn(self.tracer_at, self.settings)
+        return stage_render_fn(self.tracer_at, self.settings, transparent=self.transparent)
 
     def preview(self, shot: Shot, output: Path, progress: EventListener) -> None:
         """Render one shot to a file, progressively.
@@ -48,18 +50,26 @@ class StageRenderer:
         """
         with counted_phase("render", progress) as count:
             render_preview(
-                self.tracer_at(shot), self.settings, shot, output, lambda done, of: count(0, 1, done / of)
+                self.tracer_at(shot),
+                self.settings,
+                shot,
+                output,
+                lambda done, of: count(0, 1, done / of),
+                transparent=self.transparent,
             )
             count(1, 1)
 
 
-def compile_stage(stage: Stage, scene: StageScene, shots: Sequence[Shot]) -> StageRenderer:
+def compile_stage(
+    stage: Stage, scene: StageScene, shots: Sequence[Shot], *, transparent: bool = False
+) -> StageRenderer:
     """Read and build everything of a stage, and check the cameras.
 
     Args:
         stage: meshes, lights, environment and how the scene takes part.
         scene: the scene that it is put into.
         shots: what is to be rendered; keys of the stage count these.
+        transparent: images are to keep alpha; the scene's background is black then.
 
     Raises:
         OctasplatError: something of the stage cannot be used, or a camera stands in glass; where things
@@ -77,7 +87,7 @@ def compile_stage(stage: Stage, scene: StageScene, shots: Sequence[Shot]) -> Sta
         stage_at(stage, 0), scene, layers, shots[:1] if is_moving(stage) else shots, scene.warn
     )
     if not is_moving(stage):
-        return StageRenderer(lambda _shot: first, stage.integrator)
+        return StageRenderer(lambda _shot: first, stage.integrator, transparent)
     frames = {shot.name: number for number, shot in enumerate(shots)}
 
     def tracer_at(shot: Shot) -> PathTracer:
@@ -86,7 +96,7 @@ def compile_stage(stage: Stage, scene: StageScene, shots: Sequence[Shot]) -> Sta
         # what is odd about a file was told of the first image
         return _tracer_of(stage_at(stage, frames[shot.name]), scene, layers, (shot,), _ignore)
 
-    return StageRenderer(tracer_at, stage.integrator)
+    return StageRenderer(tracer_at, stage.integrator, transparent)
 
 
 def _tracer_of(
@@ -119,7 +129,9 @@ def _ignore(_sentence: str) -> None:
     """Tell nobody."""
 
 
-def stage_render_fn(tracer_at: Callable[[Shot], PathTracer], settings: Integrator) -> RenderFn:
+def stage_render_fn(
+    tracer_at: Callable[[Shot], PathTracer], settings: Integrator, *, transparent: bool = False
+) -> RenderFn:
     """Return the function that renders a shot of a stage to a file.
 
     ``.exr`` gets the linear picture before exposure and tone curve as R, G, B, and alpha as A; anything else
@@ -128,11 +140,12 @@ def stage_render_fn(tracer_at: Callable[[Shot], PathTracer], settings: Integrato
     Args:
         tracer_at: returns the tracer of the stage as it is in a shot.
         settings: with exposure and tone curve.
+        transparent: PNG get straight colors and alpha, EXR linear ones multiplied by alpha.
     """
 
     def paint(shot: Shot, path: Path, part: Callable[[float], None]) -> None:
         film = tracer_at(shot).render(shot.rays(), lambda done, of: part(done / of))
-        write_stage_image(path, film.image(exposure=settings.exposure, tone=settings.tone))
+        _write_film(path, film, settings, transparent)
 
     return paint
 
@@ -153,6 +166,8 @@ def render_preview(
     shot: Shot,
     path: Path,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
+    *,
+    transparent: bool = False,
 ) -> None:
     """Render one shot and rewrite it each time that its samples have about doubled.
 
@@ -165,13 +180,23 @@ def render_preview(
     done = 0
     progress(0, settings.samples)
     for film in tracer.refine(image):
-        write_stage_image(path, film.image(exposure=settings.exposure, tone=settings.tone))
+        _write_film(path, film, settings, transparent)
         done = max(1, min(2 * done, settings.samples))
         progress(done, settings.samples)
 
 
-def write_stage_image(path: Path, image: StageImage) -> None:
+def _write_film(path: Path, film: Film, settings: Integrator, transparent: bool) -> None:
+    image = film.image(exposure=settings.exposure, tone=settings.tone, transparent=transparent)
+    write_stage_image(path, image, has_alpha=transparent)
+
+
+def write_stage_image(path: Path, image: StageImage, *, has_alpha: bool = False) -> None:
     """Write an image: linear channels, alpha and compositing layers for ``.exr``, else display values.
+
+    Args:
+        path: where to.
+        image: what to write.
+        has_alpha: whether display values get alpha, too.
 
     Raises:
         OutputError: the file cannot be written.
@@ -180,4 +205,4 @@ def write_stage_image(path: Path, image: StageImage) -> None:
         layers = {name: image.rgb_linear[..., k] for k, name in enumerate("RGB")}
         write_exr(path, {**layers, "A": image.alpha, **image.layers})
     else:
-        write_png(path, image.rgb_srgb)
+        write_png(path, image.rgb_srgb, image.alpha if has_alpha else None)

@@ -272,7 +272,7 @@ def test_options_of_the_last_version_are_still_read():
         ({"seconds": 3, "frames": 30}, "choose one of"),
         ({"seconds": 1e6}, "make more than 100,000"),
         ({"background": "transparent"}, "a video has no alpha"),
-        ({"background": "transparent", "format": "png", "stage": STAGE}, "transparent in EXR only"),
+        ({"background": "transparent", "stage": STAGE}, "a video has no alpha"),
         ({"layers": True}, "goes with `stage`"),
         ({"layers": True, "stage": STAGE}, "choose the format exr"),
     ],

@@ -7,7 +7,7 @@ import pytest
 
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.pathtracing.compile_meshes import check_outside_glass, compile_meshes
-from octasplat.engine.pathtracing.mesh_shapes import primitive_shape
+from octasplat.engine.pathtracing.mesh_shapes import MeshShape, primitive_shape, turn_outwards
 from octasplat.engine.pathtracing.path_tracer import PathTracer, PathTracerScene
 from octasplat.engine.pathtracing.stage.materials import Dielectric, Diffuse, Glass, Metal, Mirror
 from octasplat.engine.pathtracing.stage.model import (
@@ -277,6 +277,30 @@ def test_glass_that_faces_inwards_is_turned_and_told(tmp_path: Path) -> None:
         seen.append(np.sort(compiled.surfaces.corner_normals.reshape(-1, 3), axis=0))
     np.testing.assert_allclose(seen[1], seen[0], atol=1e-5)
     assert len(told) == 1 and "inside_out.obj faces inwards" in told[0]
+
+
+@pytest.mark.parametrize(
+    ("balls", "turned"),
+    [
+        ([(0, 1.0, 1), (5, 0.5, -1)], [False, True]),  # beside each other
+        ([(0, 1.0, 1), (0, 0.5, -1)], [False, False]),  # a bubble
+        ([(0, 1.0, -1), (0, 0.5, 1), (5, 2.0, 1)], [True, True, False]),  # another one, inside out
+        ([(0, 1.0, 1), (0, 0.5, 1)], [False, False]),
+    ],
+)
+def test_each_solid_of_glass_is_turned_by_itself(
+    balls: list[tuple[float, float, int]], turned: list[bool]
+) -> None:
+    ball = primitive_shape("sphere")
+    count = len(ball.vertices)
+    faces = [ball.faces[:, ::side] + count * k for k, (_, _, side) in enumerate(balls)]
+    shape = MeshShape(
+        np.concatenate([radius * ball.vertices + [x, 0, 0] for x, radius, _ in balls]), np.concatenate(faces)
+    )
+    found = turn_outwards(shape, np.ones(len(shape.faces), bool))
+    changed = shape.faces[:, 0:0].any(axis=1) if found is None else (found.faces != shape.faces).any(axis=1)
+    assert [part.all() for part in np.split(changed, len(balls))] == turned
+    assert [part.any() for part in np.split(changed, len(balls))] == turned
 
 
 def test_neither_threads_nor_samples_added_later_change_a_picture_of_meshes() -> None:

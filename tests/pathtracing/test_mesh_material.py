@@ -250,6 +250,26 @@ def test_obj_materials_are_read_from_mtl(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("library", "why"),
+    [
+        ("lost.mtl", "lost.mtl is not in the folder of the OBJ"),
+        ("../things.mtl", "../things.mtl is not in the folder of the OBJ"),
+        ("things.mtl", "no MTL file has one"),
+    ],
+)
+def test_obj_material_without_entry_is_a_told_grey(tmp_path: Path, library: str, why: str) -> None:
+    for folder in (tmp_path, tmp_path / "inner"):
+        folder.mkdir(exist_ok=True)
+        (folder / "things.mtl").write_text("newmtl plain\n")
+    write_obj(tmp_path / "inner" / "a.obj", primitive_shape("plane"), f"mtllib {library}\nusemtl wood")
+    said: list[str] = []
+    found = compile_meshes(Stage(meshes=(StageMesh(file="inner/a.obj"),)), tmp_path, warn=said.append)
+    assert said == [f"inner/a.obj: of the material wood is not used: its entry, as {why}."]
+    # As an entry without a color.
+    np.testing.assert_allclose(found.materials.colors_linear, 0.6, atol=1e-6)
+
+
 def test_ply_vertex_colors_become_material(tmp_path: Path) -> None:
     plane = primitive_shape("plane")
     rows = "\n".join("{} {} {} 188 64 0".format(*vertex) for vertex in plane.vertices)

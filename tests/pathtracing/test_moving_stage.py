@@ -1,5 +1,6 @@
 """Things and lamps that move in a film: each image is that of a stage in which they stand where keys say."""
 
+import math
 from pathlib import Path
 
 import pytest
@@ -7,7 +8,7 @@ from click.testing import CliRunner, Result
 
 from octasplat.engine.core.errors import OctasplatError
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
-from octasplat.engine.pathtracing.stage.model import Stage
+from octasplat.engine.pathtracing.stage.model import DirectionalLight, Stage
 from octasplat.engine.pathtracing.stage.stage_file import read_stage
 from octasplat.engine.pathtracing.stage_motion import stage_at
 from octasplat.workers.cli.main import cli
@@ -84,6 +85,21 @@ def test_values_rest_before_and_after_their_keys() -> None:
     for frame, x in ((0, 0.0), (2, 0.0), (3, 1.0), (6, 4.0), (100, 4.0)):
         [mesh] = stage_at(stage, frame).meshes
         assert mesh.position == (x, 0.0, 0.0) and mesh.turn_degrees == 30.0 and not mesh.keys
+
+
+@pytest.mark.parametrize("degrees", [0.0, 10.0, 90.0, 170.0])
+def test_directions_turn_evenly_between_keys(degrees: float) -> None:
+    keys = [
+        {"frame": frame, "direction": (5 * math.cos(angle), 0, 5 * math.sin(angle))}
+        for frame, angle in ((0, 0.0), (4, math.radians(degrees)))
+    ]
+    lamp = {"kind": "directional", "irradiance": 1, "direction": (1, 0, 0), "keys": keys}
+    stage = Stage.model_validate({"lights": [lamp]})
+    for frame in range(5):
+        [light] = stage_at(stage, frame).lights
+        assert isinstance(light, DirectionalLight)
+        x, y, z = light.direction
+        assert math.degrees(math.atan2(z, x)) == pytest.approx(degrees * frame / 4, abs=1e-6) and y == 0
 
 
 @pytest.mark.parametrize(

@@ -9,10 +9,13 @@ from click.testing import CliRunner, Result
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.pathtracing.stage.stage_file import read_stage
+from octasplat.engine.pathtracing.stage_layout import estimate_stage_layout
 from octasplat.engine.render.image_files import read_image
+from octasplat.engine.trace.factory import make_tracer
+from octasplat.engine.trace.protocol import TraceSettings
 from octasplat.workers.cli.main import cli
 from tests.support.image_channels import read_channels
-from tests.support.light_scenes import table_with_a_box
+from tests.support.light_scenes import shiny_ball, table_with_a_box
 
 
 def octasplat(*arguments: object) -> Result:
@@ -97,7 +100,10 @@ def test_stage_object_rests_on_surface(scene: Path, tmp_path: Path) -> None:
             "[[meshes]]\nshape = 'cube'\non = { origin = [0, -2, 0], direction = [0, -1, 0] }",
             "the ray meets nothing solid",
         ),
-        ("[[meshes]]\nshape = 'cube'\non = { view = 'a.jpg', pixel = [1, 1] }", "has no photographs"),
+        (
+            "[[meshes]]\nshape = 'cube'\non = { view = 'a.jpg', pixel = [1, 1] }",
+            "meshes[0].on: a.jpg: a file of",
+        ),
     ],
 )
 def test_invalid_stage_is_refused_before_rendering(
@@ -113,12 +119,23 @@ def test_invalid_stage_is_refused_before_rendering(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(("light", "told"), [("shadowed", True), ("relit", False)])
+def test_stage_without_the_materials_of_its_scene_says_so(tmp_path: Path, light: str, told: bool) -> None:
+    ball = shiny_ball(100, 1.0, albedo=(1, 1, 1), metallic=1.0, roughness=0.2)
+    write_gaussian_ply(ball, tmp_path / "ball.ply")
+    (tmp_path / "stage.toml").write_text(f"[[gaussians]]\nlight = '{light}'\n[integrator]\nsamples = 1\n")
+    one = ("-o", tmp_path, "--turntable", "--frames", 1, "--width", 16, "--height", 16, "--threads", 1)
+    done = octasplat("render", tmp_path / "ball.ply", "--stage", tmp_path / "stage.toml", *one)
+    assert done.exit_code == 0, done.output
+    assert ("materials are left out on this stage" in " ".join(done.output.split())) == told
+
+
 def test_preview_wants_a_stage_and_one_file(scene: Path, tmp_path: Path) -> None:
     assert octasplat("render", scene, "-o", tmp_path / "a.png", "--preview").exit_code == 2
 
 
-def test_stage_init_thing_that_stands_alone_has_its_floor_at_its_foot(tmp_path: Path) -> None:
-    # A pillar of radius 0.2 from y = 0 up to y = -2 with a shelf at half height: up is -y.
+def pillar() -> FlatGaussians:
+    """A pillar of radius 0.2 from y = 0 up to y = -2 with a shelf at half height: up is -y."""
     angle, height = (part.ravel() for part in np.meshgrid(np.linspace(0, 6.2, 40), np.linspace(0, -2, 40)))
     shelf_x, shelf_z = (part.ravel() for part in np.meshgrid(*[np.linspace(-0.35, 0.35, 20)] * 2))
     means = np.concatenate(
@@ -133,14 +150,17 @@ def test_stage_init_thing_that_stands_alone_has_its_floor_at_its_foot(tmp_path: 
     )  # x to the normal
     flat = np.tile([half, 0, 0, -half], (shelf_x.size, 1))  # the normal along -y
     count = len(means)
-    pillar = FlatGaussians(
+    return FlatGaussians(
         means,
         np.concatenate([around, flat]).astype(np.float32),
         np.full((count, 2), -3.5, np.float32),
         np.full(count, 4.0, np.float32),
         np.zeros((count, 1, 3), np.float32),
     )
-    write_gaussian_ply(pillar, tmp_path / "pillar.ply")
+
+
+def test_stage_init_thing_that_stands_alone_has_its_floor_at_its_foot(tmp_path: Path) -> None:
+    write_gaussian_ply(pillar(), tmp_path / "pillar.ply")
     done = octasplat("stage", "init", tmp_path / "pillar.ply", "-o", tmp_path / "stage.toml")
     assert done.exit_code == 0, done.output
     assert "a thing that stands alone" in (tmp_path / "stage.toml").read_text()
@@ -148,3 +168,12 @@ def test_stage_init_thing_that_stands_alone_has_its_floor_at_its_foot(tmp_path: 
     assert isinstance(ball.scale, float)
     assert ball.position[1] + ball.scale == pytest.approx(0.0, abs=0.05)
     assert np.hypot(ball.position[0], ball.position[2]) > 0.2 + ball.scale
+
+
+def test_stage_init_ball_beside_a_thing_is_towards_the_first_camera() -> None:
+    tracer = make_tracer(TraceSettings(), threads=1)
+    tracer.build(pillar())
+    cameras = np.array([[4.0, -2, 0], [-4, -2, 1], [-4, -2, -1]])
+    up, centre = np.array([0.0, -1, 0]), np.array([0.0, -1, 0])
+    found = estimate_stage_layout(pillar(), tracer, up, centre, 1.5, cameras)
+    assert found.is_beside and found.floor[0] > 0.3

@@ -1,5 +1,6 @@
 """Stage files: what is refused and in which words, and the first stage that is written."""
 
+import re
 import shutil
 import subprocess
 import sys
@@ -10,7 +11,16 @@ import pytest
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.files import read_mesh
 from octasplat.engine.pathtracing.stage.materials import Diffuse, Glass, MetallicRoughness
-from octasplat.engine.pathtracing.stage.model import PointLight, RectangleLight, Stage
+from octasplat.engine.pathtracing.stage.model import (
+    Environment,
+    Integrator,
+    LightModel,
+    PointLight,
+    RectangleLight,
+    SpotLight,
+    Stage,
+    StageGaussians,
+)
 from octasplat.engine.pathtracing.stage.stage_file import (
     StageLayout,
     parse_stage,
@@ -103,6 +113,15 @@ def test_stage_file_with_all_keys_is_read(tmp_path: Path) -> None:
         (BALL + 'material = { kind = "diffuse", color = 1 }', r"material\.color; the nearest is color_srgb"),
         (BALL + "positions = [0, 0, 0]", "the nearest is position"),
         (BALL + "scale = .2", r"write 0\.2 for \.2"),
+        (BALL + 'material = "glass"', r"\.material: is a table, such as \{ kind = .* \(it is glass\)"),
+        (BALL + "on = [1, 2]", r"meshes\[0\]\.on: is a table, such as \{ view"),
+        (BALL + "keys = { frame = 1 }", r"\.keys: is a list of tables, such as \[\{ frame = 0"),
+        (
+            "[[meshes]]\nshape = 'plane'\nmaterial = { kind = 'glass' }",
+            r"meshes\[0\]: a plane encloses nothing",
+        ),
+        ("meshes = [7]", r"meshes\[0\]: is a table \(it is 7\)"),
+        ("[[environment]]", r"environment: is one table; write \[environment\] with single brackets"),
     ],
 )
 def test_stage_file_error_names_key(text: str, words: str) -> None:
@@ -155,8 +174,23 @@ def test_starter_stage_and_its_suggestions_are_valid(tmp_path: Path) -> None:
     (tmp_path / "studio.hdr").write_bytes(b"?")
     path.write_text(text[:start] + "\n".join(lines))
     full = read_stage(path)
-    assert len(full.meshes) == 2 and len(full.lights) == 3 and full.environment is not None
+    assert len(full.meshes) == 2 and len(full.lights) == 4 and full.environment is not None
     assert isinstance(full.lights[1], RectangleLight)
+
+
+def test_starter_stage_states_every_default(tmp_path: Path) -> None:
+    path = tmp_path / "stage.toml"
+    write_stage_template(path, StageLayout((0, -1, 0), (0, 0.5, 0), 2.0, (0.6, 0.8, 0)))
+    text, stage = path.read_text(), read_stage(path)
+    parts = (Integrator, LightModel, PointLight, SpotLight, RectangleLight, StageGaussians, Environment)
+    # Places have none, files neither, and keys belong to films.
+    names = {name for part in parts for name in part.model_fields} - {"keys"}
+    assert not [name for name in names if not re.search(rf"\b{name}\b", text)]
+    assert "A plane faces up" in text
+    # What stands behind a # is what is taken without it.
+    plain = re.sub(r"(?m)^# (?!material|on|\[)(\w+ = )", r"\1", text[: text.index("# A mirror for a floor")])
+    tail = re.sub(r"(?m)^# (\w+ = )", r"\1", text[text.index("[integrator]") :])
+    assert parse_stage(plain + tail, "all.toml") == stage.model_copy(update={"lights": ()})
 
 
 def test_reading_stages_needs_neither_torch_nor_numba() -> None:

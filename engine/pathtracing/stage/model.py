@@ -21,7 +21,7 @@ from octasplat.engine.pathtracing.stage.base import (
     UnitInterval,
     Vector,
 )
-from octasplat.engine.pathtracing.stage.materials import Material
+from octasplat.engine.pathtracing.stage.materials import Glass, Material
 from octasplat.engine.pathtracing.stage.motion import Keys, LightKey, MeshKey, check_keys
 
 MAX_MESHES = 1000
@@ -90,6 +90,8 @@ class StageMesh(Transformed):
         check_keys(self.keys, ("position", "turn_degrees"))
         if (self.file is None) == (self.shape is None):
             raise ValueError("give either a file or a shape")
+        if self.shape == "plane" and isinstance(self.material, Glass):
+            raise ValueError("a plane encloses nothing, so that it cannot be glass; take a flat cube")
         return self
 
 

@@ -18,6 +18,12 @@ _FORMS = {
 }
 """What the values of some keys look like."""
 _LISTS = ("meshes", "lights", "gaussians")
+_TABLES = {
+    "material": 'such as { kind = "glass" }',
+    "on": 'such as { view = "0001.jpg", pixel = [200, 300] }',
+}
+"""What tables that stand in a line look like."""
+_NO_TABLE = ("model_type", "model_attributes_type", "dict_type")
 
 
 def stage_error(fault: Mapping[str, Any], prefix: Sequence[str] = ()) -> tuple[tuple[str | int, ...], str]:
@@ -58,6 +64,12 @@ def _complaint(fault: Mapping[str, Any], path: Sequence[str | int], value: objec
         return f"there is no kind {fault['ctx']['tag']!r}; choose one of {fault['ctx']['expected_tags']}"
     if kind == "tuple_type" and name in _LISTS and isinstance(value, Mapping):
         return f"is a list; write [[{name}]] with two brackets"
+    if kind == "tuple_type" and name == "keys":
+        return f"is a list of tables, such as [{{ frame = 0, position = [0, 0, 0] }}]{_shown(value)}"
+    if kind in _NO_TABLE and len(path) == 1:
+        return f"is one table; write [{name}] with single brackets, and its keys below"
+    if kind in _NO_TABLE:
+        return f"is a table{', ' * (name in _TABLES)}{_TABLES.get(name, '')}{_shown(value)}"
     if kind in ("tuple_type", "too_short", "too_long", "missing", "float_type") and name in _FORMS:
         return f"is {_FORMS[name]}{_shown(value)}"
     if kind in ("too_long", "missing", "value_error"):

@@ -173,8 +173,9 @@ def _format_vector(values: tuple[float, ...]) -> str:
 
 
 _TEMPLATE = """\
-# A stage: things, lights and how the scene takes part. Lengths are in the scene's units, colors are
-# display values from 0 to 1, files are relative to this one. Everything that can be set: docs/light.md.
+# A stage: things, lights and how the scene takes part. Lengths are in the scene's units, angles in degrees,
+# colors display values from 0 to 1, strengths of lights linear, files relative to this one. A key that stands
+# behind a # in a part that is in use has that value without it. Everything that can be set: docs/light.md.
 {places}version = 1
 up = {up}
 
@@ -182,15 +183,20 @@ up = {up}
 # relit: its colors lit by nothing but the lights below and the ambient share.
 [[gaussians]]
 light = "shadowed"
-ambient = 0.4                    # what is left of the color in full shadow
+ambient = 0.4                    # what is left of the color in full shadow, 0 to 1
 shadows_on_meshes = true
+# shadows_on_gaussians = false   # the scene's own shadows are in its colors already
+# Left out, shadow_bias is 3 % of the scene's size, or 1.5 standard deviations of its Gaussians where that is
+# more: Gaussians that are nearer than this to a lit one cast no shadow on it.
 
 # {where} {floor}.
 [[meshes]]
-shape = "sphere"                 # or: file = "thing.obj"
+shape = "sphere"                 # or "cube", "plane"; or: file = "thing.obj"
 position = {centre}
-scale = {radius}
-smooth_degrees = 180
+scale = {radius}                 # the radius of a sphere, half the side of the others
+smooth_degrees = 180             # edges up to this angle are round
+# turn_degrees = 0.0             # about up, anticlockwise seen from above
+# rotation_degrees = [0, 0, 0]   # about the world's x, then y, then z
 material = {material}
 # material = {other_material}
 # material = {{ kind = "mirror" }}
@@ -198,7 +204,7 @@ material = {material}
 # To stand on what a pixel of a photograph shows (its position then counts from there):
 # on = {{ view = "0001.jpg", pixel = [200, 300] }}
 
-# A mirror for a floor.
+# A mirror for a floor. A plane faces up; rotation_degrees turns it to a wall.
 # [[meshes]]
 # shape = "plane"
 # position = {floor}
@@ -208,36 +214,55 @@ material = {material}
 # The light, from where it seems to come in the photographs.
 [[lights]]
 kind = "directional"
-direction = {light}
-irradiance = 2.0
+direction = {light}              # the way that the light goes
+irradiance = 2.0                 # on what faces it; of 3.14 a matt white thing is as white as it can be shown
+# color_srgb = [1, 1, 1]         # this and what follows hold for every kind of lamp
+# adds_light = false             # true: it is new, not yet in the colors of the photographs
+# lights_meshes = true
+# casts_shadows = true
+# only_shadows = false
 
 # A lamp that is a rectangle casts soft shadows.
 # [[lights]]
 # kind = "rectangle"
 # position = {lamp}
-# direction = {light}
-# width = {half}
+# direction = {light}            # the way that it faces
+# width = {half}                 # of the side that is level
 # height = {half}
-# radiance = 8.0
-# visible = false
+# radiance = 8.0                 # 1 is seen as white
+# visible = false                # left out: true
 
 # [[lights]]
 # kind = "point"
 # position = {lamp}
+# intensity = {intensity}        # at a distance d it gives the irradiance intensity / d squared
+# radius = 0.0                   # larger makes its shadows soft
+# adds_light = true              # it is new: not yet in the colors of the photographs
+
+# [[lights]]
+# kind = "spot"
+# position = {lamp}
+# direction = {light}
 # intensity = {intensity}
-# radius = 0.0                    # larger makes its shadows soft
-# adds_light = true               # it is new: not yet in the colors of the photographs
+# outer_degrees = 30.0           # from its axis; beyond there is no light
+# inner_degrees = 20.0           # up to here it has its full intensity
 
 # [environment]
 # file = "studio.hdr"
-# rotation_degrees = 0
+# rotation_degrees = 0.0         # about up, anticlockwise seen from above
 # strength = 1.0
-# visible = false                # the camera sees the scene's own background
+# visible = false                # the camera sees the scene's own background; left out: true
 
 [integrator]
 samples = 16                     # a pixel; more is smoother and slower
-max_depth = 8
-clamp = 20.0                     # keeps single paths from leaving bright specks
+max_depth = 8                    # surfaces that a path of light meets
+# roulette_depth = 4             # from this one on paths may end by chance
+clamp = 20.0                     # keeps single paths from leaving bright specks; left out: no limit
 exposure = 0.0                   # stops
 tone = "none"                    # or "reinhard", "filmic"
+# anti_aliasing = true
+# seed = 0
+# aperture = 0.0                 # diameter of the lens; with one, focus_distance says what is sharp
+# layers = false
+# denoise = false
 """
