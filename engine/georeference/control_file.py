@@ -211,8 +211,8 @@ def _parse_crs(path: Path, text: str) -> str | None:
             )
         if code in _FEET:
             raise ConfigError(
-                f"{path}: EPSG:{code} is in feet; write the points in EPSG:4326, in UTM or in the same system "
-                "in metres."
+                f"{path}: EPSG:{code} is in feet; write the points in EPSG:4326, in UTM or in the same "
+                "system in metres."
             )
         return f"EPSG:{code}"
     utm, is_south = _UTM.search(text), "+south" in text
