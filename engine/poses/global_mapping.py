@@ -20,6 +20,9 @@ MIN_OBSERVATIONS = 60
 """Points that a photograph must see to keep its place: twice what the incremental mapper asks of one."""
 _ADJUSTMENT_STEPS = 20
 """Iterations of each adjustment of all photographs, instead of 200."""
+_TRACKS_PER_PHOTOGRAPH = 300
+"""Points that places are solved with; all others are triangulated in the end. More of them take longer and
+give the same poses."""
 _MAX_REPROJECTION_ERROR_PX, _MIN_ANGLE_DEGREES = 4.0, 1.5
 """Of observations and points that are kept: the limits of the incremental mapper."""
 
@@ -40,6 +43,7 @@ def map_globally(database: Path, *, seed: int) -> list[Any]:
     options.random_seed = options.mapper.random_seed = seed
     options.min_model_size = MIN_PHOTOGRAPHS
     options.mapper.global_positioning.use_gpu = False
+    options.mapper.track_required_tracks_per_view = _TRACKS_PER_PHOTOGRAPH
     adjustment = options.mapper.bundle_adjustment.ceres
     adjustment.use_gpu = False
     adjustment.solver_options.max_num_iterations = _ADJUSTMENT_STEPS
