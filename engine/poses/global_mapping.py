@@ -3,8 +3,8 @@
 It averages the rotations of all pairs, then solves for all places and points at once, where the incremental
 mapper adds one photograph after the other and adjusts all of them again and again (Pan, Baráth, Pollefeys and
 Schönberger, "Global Structure-from-Motion Revisited", https://arxiv.org/abs/2407.20219). It places a
-photograph that few matches hold anywhere, so such photographs are taken out again: the incremental mapper
-goes on with them.
+photograph that few matches hold anywhere, so such photographs are taken out again. The incremental mapper
+goes on from what is left: it adds points and photographs, and adjusts all of them.
 """
 
 import shutil
@@ -14,7 +14,9 @@ from typing import Any
 import pycolmap
 
 from octasplat.engine.core.scene_layout import MIN_PHOTOGRAPHS
+from octasplat.engine.poses.config import RETRY_BELOW_SHARE
 from octasplat.engine.poses.incremental_mapping import model_rank
+from octasplat.engine.poses.model_selection import distinct_models, is_trustworthy
 
 MIN_OBSERVATIONS = 60
 """Points that a photograph must see to keep its place: twice what the incremental mapper asks of one."""
@@ -24,7 +26,16 @@ _TRACKS_PER_PHOTOGRAPH = 300
 """Points that places are solved with; all others are triangulated in the end. More of them take longer and
 give the same poses."""
 _MAX_REPROJECTION_ERROR_PX, _MIN_ANGLE_DEGREES = 4.0, 1.5
-"""Of observations and points that are kept: the limits of the incremental mapper."""
+"""Of observations and points that are kept."""
+
+
+def map_most_globally(database: Path, photographs: int, seed: int) -> Any | None:
+    """Return the largest model of so many photographs; None where their models do not place most of them."""
+    models = map_globally(database, seed=seed)
+    placed = {number for model in distinct_models(models) for number in model.reg_image_ids()}
+    if len(placed) < RETRY_BELOW_SHARE * photographs or not is_trustworthy(models[0]):
+        return None
+    return models[0]
 
 
 def map_globally(database: Path, *, seed: int) -> list[Any]:
@@ -55,28 +66,10 @@ def map_globally(database: Path, *, seed: int) -> list[Any]:
     pycolmap.set_random_seed(seed)
     models: dict[int, Any] = pycolmap.global_mapping(database, none, folder, options)
     for model in models.values():
-        _drop_wrong_observations(model)
+        # with the limits of the incremental mapper, as the global one ends with wider ones
+        pycolmap.ObservationManager(model).filter_all_points3D(_MAX_REPROJECTION_ERROR_PX, _MIN_ANGLE_DEGREES)
         take_out_weak_photographs(model)
-        _adjust(model)
     return sorted((m for m in models.values() if m.num_reg_images()), key=model_rank, reverse=True)
-
-
-def _drop_wrong_observations(model: Any) -> None:
-    """Drop what the incremental mapper would not have kept, as the global one ends with wider limits."""
-    pycolmap.ObservationManager(model).filter_all_points3D(_MAX_REPROJECTION_ERROR_PX, _MIN_ANGLE_DEGREES)
-
-
-def _adjust(model: Any) -> None:
-    """Adjust poses, points and lenses together, in place."""
-    if not model.num_reg_images():
-        return
-    options = pycolmap.BundleAdjustmentOptions()
-    options.ceres.use_gpu = False
-    options.ceres.solver_options.max_num_iterations = _ADJUSTMENT_STEPS
-    options.ceres.solver_options.num_threads = 1
-    options.print_summary = False
-    pycolmap.bundle_adjustment(model, options)
-    model.update_point_3d_errors()
 
 
 def take_out_weak_photographs(model: Any) -> None:

@@ -8,7 +8,7 @@ import pycolmap
 import pytest
 
 from octasplat.engine.poses import global_mapping
-from octasplat.engine.poses.global_mapping import map_globally, take_out_weak_photographs
+from octasplat.engine.poses.global_mapping import map_globally, map_most_globally, take_out_weak_photographs
 
 PHOTOGRAPHS = 8
 
@@ -66,3 +66,4 @@ def test_no_model_of_photographs_without_matches(tmp_path: Path) -> None:
     with pycolmap.Database.open(tmp_path / "empty.db"):
         pass
     assert map_globally(tmp_path / "empty.db", seed=0) == []
+    assert map_most_globally(tmp_path / "empty.db", 3, 0) is None
