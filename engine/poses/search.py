@@ -36,7 +36,6 @@ from octasplat.engine.poses.features import (
     preselect_pairs,
 )
 from octasplat.engine.poses.found_models import write_other_models
-from octasplat.engine.poses.global_mapping import map_most_globally
 from octasplat.engine.poses.gps_contradictions import GroundPositions, read_ground_positions
 from octasplat.engine.poses.incremental_mapping import best_rank, map_photographs, model_rank
 from octasplat.engine.poses.linking_pairs import NEIGHBORS_BY_NAME, propose_links
@@ -258,7 +257,11 @@ class PoseSearch:
                 threads=self._threads,
                 on_count=lambda _done: None,
             )
-        start = self._write_start(models[0]) if models else None
+        start = None
+        if models:
+            start = self._work / "start"
+            start.mkdir(exist_ok=True)
+            models[0].write_binary(start)
         return register_without_pairs_against_gps(
             mapped,
             database,
@@ -274,25 +277,15 @@ class PoseSearch:
         allow_weak_links: bool = False,
         start: Path | None = None,
     ) -> list[Any]:
-        count = len(self._names)
-        is_large = self._config.is_large(count)
-        if is_large and start is None and (model := map_most_globally(database, count, self._config.seed)):
-            start = self._write_start(model)
         return map_photographs(
             database,
             self._photographs,
             seed=self._config.seed,
             on_count=at,
-            is_large=is_large,
+            is_large=self._config.is_large(len(self._names)),
             allow_weak_links=allow_weak_links,
             start=start,
         )
-
-    def _write_start(self, model: Any) -> Path:
-        start = self._work / "start"
-        start.mkdir(exist_ok=True)
-        model.write_binary(start)
-        return start
 
     def _drop_unreadable(self) -> None:
         """Leave out photographs that COLMAP does not read, and warn of all that nobody could read.
