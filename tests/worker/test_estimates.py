@@ -37,3 +37,14 @@ def test_materials_take_more_memory_and_time() -> None:
     assert shiny.memory_bytes == pytest.approx(1.74e9, rel=0.05)  # private memory
     assert shiny.memory_bytes > plain.memory_bytes
     assert shiny.cpu_seconds > 2 * plain.cpu_seconds
+
+
+def test_estimate_counts_memory_of_search_for_poses() -> None:
+    sizes = [ImageSizes(4000, 3000, 1432)]
+    given, found = (
+        estimate_reconstruction(
+            resolve_config("fast").model_copy(update={"max_side": 2000, "poses": poses}), sizes, 2
+        ).memory_bytes
+        for poses in ("given", "auto")
+    )
+    assert given < 2e9 and 3.8e9 / 1.2 < found < 3.8e9 * 1.2
