@@ -11,10 +11,12 @@ from jaxtyping import Int64
 
 from octasplat.engine.poses.ambiguous_structure import count_pair_inliers, find_false_pairs, remove_pairs
 from octasplat.engine.poses.config import SEPARATE_PARTS_FROM
+from octasplat.engine.poses.global_positioning import position_photographs
 from octasplat.engine.poses.gps_contradictions import (
     GroundPositions,
     find_gps_contradictions,
     find_outliers_against_gps,
+    find_turned_pairs,
     gps_error_m,
 )
 from octasplat.engine.poses.incremental_mapping import best_rank
@@ -28,6 +30,8 @@ MAX_ERROR_SHARE_OF_BETTER = 0.7
 MIN_PLACED_SHARE = 0.75
 """Of the photographs that had poses, those that have one in the models that agree better."""
 _MAX_DISAMBIGUATIONS = 3
+_MAX_POSITIONINGS = 6
+"""Rough poses of all photographs before these are mapped; the last ones find no more pairs as a rule."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +107,24 @@ def leave_out_conflicting_pairs(
         trial.replace(database)
         models = again
     return models
+
+
+def leave_out_pairs_before_mapping(database: Path, ground_m: GroundPositions, seed: int) -> int:
+    """Remove the false pairs that rough poses and GPS contradict, and return how many they were.
+
+    Args:
+        database: loses the false pairs.
+        ground_m: by GPS.
+        seed: of everything random.
+    """
+    removed = 0
+    for _ in range(_MAX_POSITIONINGS if ground_m else 0):
+        model = position_photographs(database, seed)
+        if model is None or not len(pairs := find_turned_pairs(model, database, ground_m)):
+            break
+        remove_pairs(database, pairs)  # which may have held back others
+        removed += len(pairs)
+    return removed
 
 
 def leave_out_pairs_against_gps(

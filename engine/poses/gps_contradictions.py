@@ -95,6 +95,29 @@ def find_gps_contradictions(
     return GpsContradictions(photographs.votes.pairs[is_false], photographs.around(is_false))
 
 
+def find_turned_pairs(model: Any, database: Path, ground_m: GroundPositions) -> Int64[np.ndarray, "f 2"]:
+    """Return the pairs that falsely join photographs of a model that has poses alone, and few points.
+
+    Their neighborhoods are turned against each other by GPS, and their matches say so, too. All matches of a
+    pair count as links.
+
+    Args:
+        model: a ``pycolmap.Reconstruction``.
+        database: with the matches; is only read.
+        ground_m: by GPS.
+    """
+    of_model, may_be_folded = _photographs_by_model([model], ground_m)
+    if not any(may_be_folded):
+        return np.zeros((0, 2), np.int64)
+    with pycolmap.Database.open(database) as source:
+        ids, counts = source.read_two_view_geometry_num_inliers()
+    pairs = np.array([pycolmap.pair_id_to_image_pair(pair_id) for pair_id in ids], np.int64).reshape(-1, 2)
+    matches = np.array(counts, np.int64)
+    votes = PairInliers(pairs, matches, np.zeros_like(matches)).select(matches > 0)
+    photographs = _Photographs([model], of_model, votes, ground_m)
+    return np.asarray(photographs.votes.pairs[photographs.find_turned(database)])
+
+
 def find_outliers_against_gps(
     model: Any, votes: PairInliers, database: Path, ground_m: GroundPositions
 ) -> Int64[np.ndarray, "f 2"]:
@@ -175,6 +198,13 @@ class _Photographs:
         angles = self._angles_to_gps(database, np.flatnonzero(is_asked))
         is_false[is_asked] = np.where(np.isnan(angles), (is_inside & holds)[is_asked], angles > MAX_TURN)
         return is_false
+
+    def find_turned(self, database: Path) -> Bool[np.ndarray, " p"]:
+        """Return which pairs turn the second camera otherwise than GPS does, and their neighborhoods, too."""
+        is_turned, _ = find_contradictions(self._fits, self._links, self._centers, self._ground_m)
+        # no number is more than another one
+        is_turned[is_turned] = self._angles_to_gps(database, np.flatnonzero(is_turned)) > MAX_TURN
+        return is_turned
 
     def find_false_outliers(self, database: Path) -> Bool[np.ndarray, " p"]:
         """Return which pairs have more outliers than inliers, and a turn that contradicts GPS."""

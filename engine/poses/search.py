@@ -25,6 +25,7 @@ from octasplat.engine.poses.disambiguation import (
     MappedModels,
     describe_gps_contradictions,
     disambiguate,
+    leave_out_pairs_before_mapping,
     register_without_pairs_against_gps,
 )
 from octasplat.engine.poses.features import (
@@ -144,6 +145,11 @@ class PoseSearch:
         database = Path(shutil.copyfile(database, self._work / "mapping.db"))
         with progress_stage(MAPPING_STAGE, count, self._progress) as at:
             ground_m = read_ground_positions(database)
+            # what is large takes too long to be mapped a second time
+            if self._config.is_large(count) and (
+                removed := leave_out_pairs_before_mapping(database, ground_m, self._config.seed)
+            ):
+                self._progress(Warned(f"{removed} pairs of photographs that contradict GPS were left out."))
             mapped = disambiguate(
                 self._map(database, at), database, ground_m, lambda copy: self._map(copy, at)
             )

@@ -15,8 +15,10 @@ from octasplat.engine.poses.disambiguation import (
     describe_gps_contradictions,
     disambiguate,
     leave_out_pairs_against_gps,
+    leave_out_pairs_before_mapping,
     register_without_pairs_against_gps,
 )
+from octasplat.engine.poses.global_positioning import position_photographs
 from octasplat.engine.poses.gps_contradictions import (
     find_gps_contradictions,
     read_ground_positions,
@@ -182,6 +184,23 @@ def test_photographs_of_all_models_count_in_large_captures(street: Street) -> No
     mapped = MappedModels(street.parts)
     assert mapped.placed(99) == street.parts[0].num_reg_images() < 2 * WALK
     assert mapped.placed(100) == 2 * WALK
+
+
+def test_false_pairs_are_left_out_before_mapping(street: Street, tmp_path: Path) -> None:
+    database = copied(street, tmp_path)
+    before, ground_m = pairs_of(database), read_ground_positions(database)
+    removed = leave_out_pairs_before_mapping(database, ground_m, 0)
+    with pycolmap.Database.open(database) as opened:
+        left = [pycolmap.pair_id_to_image_pair(pair) for pair in opened.read_two_view_geometries()[0]]
+    across = [pair for pair in left if pair[0] <= WALK < pair[1]]
+    assert removed == before - len(left) > 60 and not across
+    assert leave_out_pairs_before_mapping(copied(street, tmp_path), {}, 0) == 0
+
+
+def test_rough_poses_of_photographs_without_matches(tmp_path: Path) -> None:
+    with pycolmap.Database.open(tmp_path / "empty.db"):
+        pass
+    assert position_photographs(tmp_path / "empty.db", 0) is None
 
 
 @pytest.mark.parametrize("comes_to", ["whole", "parts", "folded", "half"])
