@@ -36,5 +36,8 @@ def position_photographs(database: Path, seed: int) -> Any | None:
     folder.mkdir()
     pycolmap.set_random_seed(seed)
     # in an empty folder there are no photographs to take colors from
-    models = pycolmap.global_mapping(database, folder, folder, options)
+    try:
+        models = pycolmap.global_mapping(database, folder, folder, options)
+    except RuntimeError:  # as of a system that cannot be solved; the mapping does without
+        return None
     return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
