@@ -88,7 +88,8 @@ class Film:
     def add(self, paths: PathArrays, pixels: Int64[np.ndarray, " n"]) -> None:
         """Add finished paths, equally many for each of ``pixels``, those of one pixel consecutive."""
         each = len(paths.keys) // len(pixels)
-        add_paths(len(pixels), paths, each, pixels, 0, self.sums, self.sums_without_meshes)
+        left_out = np.zeros(len(pixels), np.bool_)
+        add_paths(len(pixels), paths, each, pixels, 0, self.sums, self.sums_without_meshes, left_out)
 
     def gaussian_surface(self) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
         """Return the mean linear radiance of the visible Gaussians with materials, and their coverage."""

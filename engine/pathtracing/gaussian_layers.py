@@ -14,8 +14,10 @@ from octasplat.engine.gaussians.channels import stack_channels
 from octasplat.engine.gaussians.materials import MATERIAL_WIDTHS, has_materials
 from octasplat.engine.gaussians.merge import merge_scenes
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
+from octasplat.engine.pathtracing.gaussian_boxes import bounding_boxes
 from octasplat.engine.pathtracing.kernels.gaussian_layer import ADDITIVE, AMBIENT, RELIT, SHADOWED
 from octasplat.engine.pathtracing.kernels.gaussian_surface import ALBEDO, FEATURE_COUNT, MATERIAL, RAY_OFFSET
+from octasplat.engine.pathtracing.kernels.path_args import GaussianBoxes
 from octasplat.engine.pathtracing.mesh_shapes import rotation_matrix
 from octasplat.engine.pathtracing.stage.model import Stage, StageGaussians
 from octasplat.engine.trace.facing_normals import face_viewer
@@ -38,6 +40,7 @@ class GaussianLayers:
     Attributes:
         tracer: all Gaussians, with features as in
             :mod:`octasplat.engine.pathtracing.kernels.gaussian_layer`.
+        boxes: around them.
         min_transmittance: transmittance at which a ray counts as ended.
         mesh_shadow_tracer: those that cast shadows on meshes; None where none do.
         gaussian_shadow_tracer: those that cast shadows on Gaussians.
@@ -48,6 +51,7 @@ class GaussianLayers:
     """
 
     tracer: Tracer
+    boxes: GaussianBoxes
     min_transmittance: float
     mesh_shadow_tracer: Tracer | None = None
     gaussian_shadow_tracer: Tracer | None = None
@@ -118,11 +122,14 @@ def build_gaussian_layers(
         some.build(merged.select(chosen))
         return some
 
-    casting = np.concatenate(on_gaussians)
+    casting, casting_on_meshes = np.concatenate(on_gaussians), np.concatenate(on_meshes)
     return GaussianLayers(
         tracer=tracer,
+        boxes=GaussianBoxes(
+            bounding_boxes(merged, settings.q), bounding_boxes(merged.select(casting_on_meshes), settings.q)
+        ),
         min_transmittance=settings.transmittance_min,
-        mesh_shadow_tracer=caster(np.concatenate(on_meshes)),
+        mesh_shadow_tracer=caster(casting_on_meshes),
         gaussian_shadow_tracer=caster(casting),
         non_shadow_tracer=caster(~casting),
         shadow_bias=max(biases),

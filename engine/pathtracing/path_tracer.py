@@ -5,7 +5,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from queue import Queue
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
@@ -33,8 +32,6 @@ from octasplat.engine.pathtracing.kernels.path_args import (
     CameraRays,
     MeshHits,
     PathArrays,
-    PathBlock,
-    PathScratch,
     ShadowRayArrays,
     SurfaceInteractions,
     allocate_media,
@@ -45,12 +42,11 @@ from octasplat.engine.pathtracing.kernels.path_args import (
 from octasplat.engine.pathtracing.kernels.path_radiance import add_direct_light
 from octasplat.engine.pathtracing.kernels.path_surfaces import shade_surfaces
 from octasplat.engine.pathtracing.kernels.shadow_rays import shadow_transmittance
-from octasplat.engine.pathtracing.kernels.trace_paths import trace_paths
+from octasplat.engine.pathtracing.mesh_paths import NO_BOXES, MeshPaths
 from octasplat.engine.pathtracing.path_batches import (
     PATHS_PER_THREAD,
     Batch,
     ImageBatches,
-    allocate_path_block,
     optical_axis,
 )
 from octasplat.engine.pathtracing.stage.model import Integrator, Stage
@@ -61,7 +57,9 @@ PATHS_PER_WAVE = 1 << 18
 """Paths that are traced together through Gaussians."""
 MIN_TILE_PIXELS = 64
 MIN_ROWS_PER_THREAD = 8192
-INFINITE_T_MAX = np.full(1, np.inf, np.float32)
+MOST_NEAR_GAUSSIANS, BATCHES_WITHOUT_ATTEMPT = 0.5, 7
+"""Share of pixels near Gaussians above which a batch was not worth its attempt without them, and number of
+batches after it that go without one."""
 
 ProgressCallback = Callable[[int, int], None]
 
@@ -114,6 +112,8 @@ class PathTracer:
             environment_visible=scene.meshes.environment_visible,
             background_linear=background.astype(np.float64),
         )
+        boxes = NO_BOXES if scene.layers is None else scene.layers.boxes
+        self._mesh_paths = MeshPaths(scene.meshes, boxes, self._integrator, self._pool, self._scratches)
         self._denoise = load_denoiser() if settings.denoise else None
         self._plate: PathTracer | None = None
         if settings.layers:
@@ -182,7 +182,7 @@ class PathTracer:
         order = tile_order(image.height_px, image.width_px)
         together = PATHS_PER_THREAD if self._scene.layers is None else PATHS_PER_WAVE
         # Always the same cut, as what is traced together may differ in the last digit.
-        at_once = min(count, together // MIN_TILE_PIXELS)
+        at_once = min(count, PATHS_PER_THREAD // MIN_TILE_PIXELS)
         pixels = together // at_once // MIN_TILE_PIXELS * MIN_TILE_PIXELS
         tops = range(0, len(order), pixels)
         blocks = range(0, count, at_once)
@@ -200,22 +200,10 @@ class PathTracer:
 
     def _trace_per_thread(self, film: Film, image: ImageBatches) -> Iterator[None]:
         """Trace paths among meshes only, a batch per thread; yield before each batch that is awaited."""
-        scene, queries = self._scene.meshes.scene, self._scene.meshes.queries
-        free: Queue[tuple[PathScratch, PathBlock]] = Queue()
-        for scratch in self._scratches:
-            free.put((scratch, allocate_path_block()))
-
-        def work(batch: Batch) -> None:
-            scratch, block = free.get()
-            try:
-                trace_paths(
-                    len(batch.pixels), scratch, self._integrator, image.start(batch), scene, queries,
-                    image.t_min, INFINITE_T_MAX, block, film.sums, film.sums_without_meshes,
-                )  # fmt: skip
-            finally:
-                free.put((scratch, block))
-
-        tasks = [self._pool.submit(work, batch) for batch in image.batches]
+        tasks = [
+            self._mesh_paths.submit(film, image.start(batch), image.t_min, np.zeros(len(batch.pixels), bool))
+            for batch in image.batches
+        ]
         try:
             for task in tasks:
                 yield  # callers report progress, or stop, before each wait
@@ -225,14 +213,28 @@ class PathTracer:
                 task.cancel()
 
     def _trace_wavefront(self, film: Film, image: ImageBatches) -> Iterator[None]:
-        """Trace paths among Gaussians, all threads on one batch; yield before each."""
+        """Trace paths among Gaussians, all threads on one batch; yield before each.
+
+        Pixels whose paths come near to none are finished among the meshes alone, which costs less. Where
+        those are few, the next batches do without the attempt.
+        """
+        skipped = 0
         for batch in image.batches:
             yield
-            paths = allocate_paths(len(batch.pixels) * batch.paths_per_pixel)
-            start = image.start(batch)
+            start, pixels = image.start(batch), batch.pixels
+            if skipped == 0:
+                near = self._mesh_paths.finish_far_pixels(film, start, image.t_min, len(pixels))
+                skipped = BATCHES_WITHOUT_ATTEMPT if near.mean() > MOST_NEAR_GAUSSIANS else 0
+                pixels = pixels[near]
+                start = start._replace(pixel_order=pixels, first_pixel=0)
+            else:
+                skipped -= 1
+            if len(pixels) == 0:
+                continue
+            paths = allocate_paths(len(pixels) * batch.paths_per_pixel)
             self._run_kernel(start_paths, len(paths.keys), self._integrator, start, paths)
             self._trace_paths(paths, image.t_min)
-            film.add(paths, batch.pixels)
+            film.add(paths, pixels)
 
     def radiance(
         self,

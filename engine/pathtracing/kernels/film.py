@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 
 from octasplat.engine.core.compilation import kernel
 from octasplat.engine.pathtracing.kernels.path_args import PathArrays
@@ -121,13 +121,16 @@ def add_paths(
     first_pixel: int,
     film: FilmArrays,
     without_meshes: FilmArrays,
+    is_left_out: Bool[np.ndarray, " i"],
 ) -> None:
     """Add ``paths_per_pixel`` paths to each of ``count`` of the ``pixels``, from the first one on.
 
     All is summed in float64, one after the other. ``without_meshes`` gets those that meet no mesh, unless it
-    has no rows.
+    has no rows. Pixels that are left out get nothing.
     """
     for i in range(count):
+        if is_left_out[i]:
+            continue
         pixel, first, last = pixels[first_pixel + i], i * paths_per_pixel, (i + 1) * paths_per_pixel
         _add_pixel(paths, first, last, False, film, pixel)
         if len(film.albedo_linear) > 0:

@@ -238,6 +238,18 @@ class PathStart(NamedTuple):
     first_sample: int
 
 
+class GaussianBoxes(NamedTuple):
+    """Boxes around Gaussians, each its least and its greatest corner; none where there are no Gaussians.
+
+    Attributes:
+        all: around all of them.
+        casting_shadows: around those that cast shadows on meshes.
+    """
+
+    all: Float32[np.ndarray, "b 6"]
+    casting_shadows: Float32[np.ndarray, "c 6"]
+
+
 class PathBlock(NamedTuple):
     """Memory in which one thread follows a block of paths.
 

@@ -1,9 +1,10 @@
 """Paths among meshes alone, from the camera to their ends, a block that stays in the cache at a time."""
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32
 
 from octasplat.engine.core.compilation import kernel
+from octasplat.engine.pathtracing.kernels.box_tests import end_paths_in_boxes, mark_shadows_in_boxes
 from octasplat.engine.pathtracing.kernels.camera_paths import start_paths
 from octasplat.engine.pathtracing.kernels.cutouts import pass_surfaces
 from octasplat.engine.pathtracing.kernels.film import FilmArrays, add_paths
@@ -11,6 +12,7 @@ from octasplat.engine.pathtracing.kernels.kernel_args import IntegratorParameter
 from octasplat.engine.pathtracing.kernels.path_args import (
     BLOCK_SIZE,
     Bounce,
+    GaussianBoxes,
     PathBlock,
     PathScratch,
     PathStart,
@@ -32,13 +34,16 @@ def trace_paths(
     t_min: Float32[np.ndarray, "1"],
     t_max: Float32[np.ndarray, "1"],
     block: PathBlock,
+    boxes: GaussianBoxes,
     film: FilmArrays,
     without_meshes: FilmArrays,
+    enters_box: Bool[np.ndarray, " i"],
 ) -> None:
     """Start and end the paths of ``count`` pixels, and add them to a film.
 
     The camera sees nothing nearer than ``t_min``; ``t_max`` is infinite. A block has room for all paths that
-    a pixel starts at a time.
+    a pixel starts at a time. ``enters_box``, all False before, tells of which pixels a path may meet
+    Gaussians: nothing is added to those.
     """
     paths, active, hits, shadows, transmittance = block
     each = start.paths_per_pixel
@@ -49,6 +54,7 @@ def trace_paths(
         first = start.first_pixel + begin
         part = PathStart(start.camera_rays, start.pixel_order, first, each, start.first_sample)
         start_paths(0, left, scratch, integrator, part, paths)
+        enters = enters_box[begin : begin + pixels]
         for k in range(left):
             active[k] = k
         for depth in range(integrator.max_depth + 1):
@@ -64,8 +70,12 @@ def trace_paths(
             bounce = Bounce(paths, active, depth, hits, scene, integrator, shadows)
             if queries.any_cutout or scene.any_nested:
                 pass_surfaces(0, left, scratch, queries, bounce)
+            if len(boxes.all) > 0:
+                end_paths_in_boxes(boxes.all, bounce, left, each, enters)
             # --- surfaces, and light that reaches them ---
             shade_surfaces(0, left, scratch, bounce)
+            if len(boxes.casting_shadows) > 0:
+                mark_shadows_in_boxes(boxes.casting_shadows, bounce, left, each, enters)
             shadow_transmittance(
                 0, left, scratch, queries, scene.surfaces, scene.materials, shadows, False, transmittance
             )
@@ -73,10 +83,10 @@ def trace_paths(
             # --- the paths that go on ---
             going = 0
             for k in range(left):
-                if paths.is_alive[active[k]]:
+                if paths.is_alive[active[k]] and not enters[active[k] // each]:
                     active[going] = active[k]
                     going += 1
             left = going
             if left == 0:
                 break
-        add_paths(pixels, paths, each, start.pixel_order, first, film, without_meshes)
+        add_paths(pixels, paths, each, start.pixel_order, first, film, without_meshes, enters)
