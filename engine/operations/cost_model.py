@@ -29,8 +29,10 @@ _LARGE_FEATURES_CPU_SECONDS_PER_PIXEL = 5.0e-7
 _LARGE_MATCH_CPU_SECONDS_PER_PAIR = 0.077
 _LARGE_MAP_CPU_SECONDS_PER_PHOTOGRAPH = 1.1
 """The same in captures of more photographs than ``quick_look_up_to``, measured with 2,000 of 12 MP."""
-_READ_CPU_SECONDS_PER_PIXEL = 2.0e-8
-"""To read photographs to their ends, and once more by COLMAP."""
+_READ_CPU_SECONDS_PER_PIXEL = 0.9e-8
+"""To read photographs to their ends."""
+_IMPORT_CPU_SECONDS_PER_PIXEL = 1.1e-8
+"""To read them once more by COLMAP, which uses one core."""
 _DECODE_CPU_SECONDS_PER_PIXEL = 1.2e-8
 """By COLMAP."""
 _LOAD_CPU_SECONDS_PER_PIXEL = 1.0e-7
@@ -165,7 +167,7 @@ def estimate_reconstruction(
     each_pixel = _MATERIAL_EVALUATE_CPU_SECONDS_PER_PIXEL if materials else _EVALUATE_CPU_SECONDS_PER_PIXEL
     full_pixels = sum(sizes.width_px * sizes.height_px * sizes.count for sizes in photographs)
     finds_poses = options.poses == "auto"
-    search = _pose_search_cpu_seconds(photographs) if finds_poses else {}
+    search, serial = _pose_search_cpu_seconds(photographs) if finds_poses else ({}, {})
     lifting = _LIFT_CPU_SECONDS_PER_POINT * min(train.initial_points, gaussians) * train.plane_sweep_init
     stages = {
         **search,
@@ -186,10 +188,10 @@ def estimate_reconstruction(
         memory = max(memory, _START_BYTES + _MAPPED_BYTES_PER_PHOTOGRAPH * count)
     disk = reconstruction_bytes(options, photographs)
     found = _make_estimate(
-        cpu_seconds, memory, cores, finds_poses=finds_poses, disk_bytes=disk, stages=stages
+        cpu_seconds, memory, cores, finds_poses=finds_poses, disk_bytes=disk, stages=stages, serial=serial
     )
-    share = sum(search.values()) / cpu_seconds
-    return found.model_copy(update={"poses_seconds": round(share * found.seconds, 1)})
+    searching = sum(found.stage_seconds[name] for name in search)
+    return found.model_copy(update={"poses_seconds": round(searching, 1)})
 
 
 def gaussians_within(
@@ -211,29 +213,30 @@ def model_bytes(photographs: int) -> int:
     return _MODEL_BYTES_PER_PHOTOGRAPH * photographs
 
 
-def _pose_search_cpu_seconds(photographs: Sequence[ImageSizes]) -> dict[str, float]:
-    """Return the time to find the poses of photographs by stage, if one search places them all."""
+def _pose_search_cpu_seconds(photographs: Sequence[ImageSizes]) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the time to find the poses of photographs by stage, if one search places them all.
+
+    The second is what of it runs on one core.
+    """
     shrunk = [capped_sizes(sizes, MAX_IMAGE_SIDE_PX) for sizes in photographs]
     count = sum(sizes.count for sizes in shrunk)
     pixels = sum(sizes.width_px * sizes.height_px * sizes.count for sizes in shrunk)
     full_pixels = sum(sizes.width_px * sizes.height_px * sizes.count for sizes in photographs)
-    reading = _READ_CPU_SECONDS_PER_PIXEL * full_pixels
+    importing = _IMPORT_CPU_SECONDS_PER_PIXEL * full_pixels
+    reading = _READ_CPU_SECONDS_PER_PIXEL * full_pixels + importing
     looks, pairs = DEFAULT_CONFIG.expected_pairs(count)
     looking = _PRESELECT_CPU_SECONDS_PER_PAIR * looks
     if DEFAULT_CONFIG.is_large(count):
         decoding = _DECODE_CPU_SECONDS_PER_PIXEL * full_pixels
-        return {
-            "read": reading,
-            "features": _LARGE_FEATURES_CPU_SECONDS_PER_PIXEL * pixels + decoding,
-            "matches": _LARGE_MATCH_CPU_SECONDS_PER_PAIR * pairs + looking,
-            "poses": _LARGE_MAP_CPU_SECONDS_PER_PHOTOGRAPH * count,
-        }
-    return {
-        "read": reading,
-        "features": _FEATURES_CPU_SECONDS_PER_PIXEL * pixels,
-        "matches": _MATCH_CPU_SECONDS_PER_PAIR * pairs + looking,
-        "poses": _MAP_CPU_SECONDS_PER_PHOTOGRAPH * count,
-    }
+        mapping = _LARGE_MAP_CPU_SECONDS_PER_PHOTOGRAPH * count
+        features = _LARGE_FEATURES_CPU_SECONDS_PER_PIXEL * pixels + decoding
+        matches = _LARGE_MATCH_CPU_SECONDS_PER_PAIR * pairs + looking
+    else:
+        mapping = _MAP_CPU_SECONDS_PER_PHOTOGRAPH * count
+        features = _FEATURES_CPU_SECONDS_PER_PIXEL * pixels
+        matches = _MATCH_CPU_SECONDS_PER_PAIR * pairs + looking
+    stages = {"read": reading, "features": features, "matches": matches, "poses": mapping}
+    return stages, {"read": importing, "poses": mapping}
 
 
 def _export_cpu_seconds(options: ReconstructionConfig, gaussians: int) -> float:
@@ -316,17 +319,22 @@ def _make_estimate(
     finds_poses: bool = False,
     disk_bytes: int = 0,
     stages: Mapping[str, float] | None = None,
+    serial: Mapping[str, float] | None = None,
     max_disk_bytes: int = 0,
 ) -> Estimate:
+    """Return an estimate from CPU seconds, in all and by stage; those of ``serial`` run on one core."""
     speedup = max(1, cores) ** _CORE_POWER
+    # by the clock, on one core takes this much longer
+    longer = {name: seconds * (1 - 1 / speedup) for name, seconds in (serial or {}).items()}
+    by_stage = {name: seconds / speedup + longer.get(name, 0.0) for name, seconds in (stages or {}).items()}
     return Estimate(
         cpu_seconds=round(cpu_seconds, 1),
-        seconds=round(cpu_seconds / speedup, 1),
+        seconds=round(cpu_seconds / speedup + sum(longer.values()), 1),
         cores=max(1, cores),
         memory_bytes=round(memory_bytes),
         finds_poses=finds_poses,
         disk_bytes=disk_bytes,
-        stage_seconds={name: round(seconds / speedup, 1) for name, seconds in (stages or {}).items()},
+        stage_seconds={name: round(seconds, 1) for name, seconds in by_stage.items()},
         max_disk_bytes=max_disk_bytes,
     )
 
