@@ -11,9 +11,9 @@ from jaxtyping import Float64
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.georeference import WGS84, Georeference, matrix_rows, similarity_scale
 from octasplat.engine.dataset.dataset import Dataset
+from octasplat.engine.dataset.photograph_gps import read_gps
 from octasplat.engine.georeference.control_file import ControlFile
 from octasplat.engine.georeference.control_positions import ScenePoints
-from octasplat.engine.georeference.photograph_gps import read_gps
 from octasplat.engine.georeference.request import GeoreferenceRequest, KnownLength
 from octasplat.engine.georeference.similarity import Fit, SimilarityError, fit_similarity
 from octasplat.engine.render.upright import estimate_up

@@ -10,8 +10,10 @@ SQLite file gives up the locks of all.
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import numpy as np
 import pycolmap
 
+from octasplat.engine.dataset.photograph_gps import read_latitude_longitude
 from octasplat.engine.poses.config import (
     MAX_FEATURES,
     MAX_IMAGE_SIDE_PX,
@@ -75,7 +77,24 @@ def create_database(
             with pycolmap.Database.open(database) as made:
                 options.existing_camera_id = 1 if made.num_cameras() else -1
         on_count(start + len(some))
+    _add_gps_without_altitude(database, photographs)
     return photographs_of(database)
+
+
+def _add_gps_without_altitude(database: Path, photographs: Path) -> None:
+    """Add the GPS of photographs without an altitude, which COLMAP leaves out, at an altitude of 0."""
+    with pycolmap.Database.open(database) as made:
+        located = {prior.corr_data_id.id for prior in made.read_all_pose_priors() if prior.has_position()}
+        for image in made.read_all_images():
+            place = None
+            if image.image_id not in located:
+                place = read_latitude_longitude(photographs / image.name)
+            if place is not None:
+                prior = pycolmap.PosePrior()
+                prior.corr_data_id = image.data_id
+                prior.position = np.array([*place, 0.0])
+                prior.coordinate_system = pycolmap.PosePriorCoordinateSystem.WGS84
+                made.write_pose_prior(prior)
 
 
 def photographs_of(database: Path) -> tuple[str, ...]:

@@ -10,8 +10,8 @@ from PIL.ExifTags import GPS
 
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.georeference import Georeference
+from octasplat.engine.dataset.photograph_gps import read_gps
 from octasplat.engine.georeference.find_georeference import find_georeference
-from octasplat.engine.georeference.photograph_gps import read_gps
 from octasplat.engine.georeference.request import read_request
 from tests.support.located_scene import (
     PLACE,

@@ -68,13 +68,17 @@ def test_vocabulary_proposes_photographs_of_one_place(
     assert told[-1][1] == 1.0
 
 
+@pytest.mark.parametrize("without_altitude", [slice(0), slice(0, None, 2), slice(None)])
 def test_gps_proposes_what_was_taken_nearby(
-    tmp_path_factory: pytest.TempPathFactory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path_factory: pytest.TempPathFactory,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    without_altitude: slice,
 ) -> None:
     scene = make_tiny_dataset(tmp_path_factory, views=12)
     names = sorted(path.name for path in (scene / "images").iterdir())
     metres = np.array([[40.0 * ((5 * k) % 12), 0.0, 2.0] for k in range(12)])
-    write_gps(scene, dict(zip(names, metres, strict=True)))
+    write_gps(scene, dict(zip(names, metres, strict=True)), without_altitude=names[without_altitude])
     create_database(tmp_path / "a.db", scene / "images", names, one_camera=True)
     monkeypatch.setattr("octasplat.engine.poses.pair_proposals.PROPOSALS_PER_PHOTOGRAPH", 2)
     monkeypatch.setattr("octasplat.engine.poses.pair_proposals.NEIGHBORS_BY_NAME", 0)

@@ -1,6 +1,6 @@
 """Generated photographs whose place on the Earth is known, with GPS written into them by Pillow."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from fractions import Fraction
 from pathlib import Path
 
@@ -38,8 +38,10 @@ def camera_centres(scene: Path) -> dict[str, np.ndarray]:
     return {view.name: view.origin_world + np.array(model.origin_world) for view in model.views}
 
 
-def write_gps(scene: Path, metres: Mapping[str, np.ndarray]) -> None:
-    """Write positions in metres about :data:`PLACE` into photographs, as EXIF."""
+def write_gps(
+    scene: Path, metres: Mapping[str, np.ndarray], *, without_altitude: Collection[str] = ()
+) -> None:
+    """Write positions in metres about :data:`PLACE` into the EXIF of photographs, of some without altitude."""
     earth = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
     for name, position in metres.items():
         latitude, longitude, height = earth.enu_to_ellipsoid(position[None], *PLACE)[0].tolist()
@@ -52,9 +54,12 @@ def write_gps(scene: Path, metres: Mapping[str, np.ndarray]) -> None:
             ExifTags.GPS.GPSLatitude: _sexagesimal(abs(latitude)),
             ExifTags.GPS.GPSLongitudeRef: "E" if longitude >= 0 else "W",
             ExifTags.GPS.GPSLongitude: _sexagesimal(abs(longitude)),
-            ExifTags.GPS.GPSAltitudeRef: b"\0",
-            ExifTags.GPS.GPSAltitude: _rational(height, 10**6),
         }
+        if name not in without_altitude:
+            exif[ExifTags.IFD.GPSInfo] |= {
+                ExifTags.GPS.GPSAltitudeRef: b"\0",
+                ExifTags.GPS.GPSAltitude: _rational(height, 10**6),
+            }
         image.save(path, exif=exif)
 
 
