@@ -41,7 +41,7 @@ def camera_centres(scene: Path) -> dict[str, np.ndarray]:
 def write_gps(
     scene: Path, metres: Mapping[str, np.ndarray], *, without_altitude: Collection[str] = ()
 ) -> None:
-    """Write positions in metres about :data:`PLACE` into the EXIF of photographs, of some without altitude."""
+    """Write positions in metres about :data:`PLACE` into the EXIF of photographs, some without altitude."""
     earth = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
     for name, position in metres.items():
         latitude, longitude, height = earth.enu_to_ellipsoid(position[None], *PLACE)[0].tolist()
