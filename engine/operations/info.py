@@ -172,7 +172,7 @@ def run(
     """Collect facts on a scene; see :class:`octasplat.engine.operations.base.Run`.
 
     Raises:
-        ConfigError: the cameras of the photographs share no centre or no up direction, or a file to write is
+        ConfigError: the cameras of the photographs share no up direction, or a file to write is
             the scene.
         SceneFileError: the scene cannot be read.
         OutputError: there is no scene yet, or a file cannot be written.

@@ -52,7 +52,7 @@ def inspect_scene(scene: StageScene, up_world: Float64[np.ndarray, "3"] | None) 
     """Inspect a scene; ``up_world`` is the up direction that the user states for a file.
 
     Raises:
-        ConfigError: the cameras of the photographs share no centre or no up direction.
+        ConfigError: the cameras of the photographs share no up direction.
     """
     up = scene.turntable(up_world).up_world
     photographs = None if scene.photographs is None else len(scene.photographs.views)
@@ -63,7 +63,7 @@ def trace_picture(scene: StageScene, up_world: Float64[np.ndarray, "3"] | None) 
     """Trace a small picture of a scene, as :func:`inspect_scene` does of its facts.
 
     Raises:
-        ConfigError: the cameras of the photographs share no centre or no up direction.
+        ConfigError: the cameras of the photographs share no up direction.
     """
     if scene.photographs is None:
         (camera,) = turntable_cameras(scene.turntable(up_world), 1, PICTURE_SIDE_PX, PICTURE_SIDE_PX)

@@ -58,7 +58,7 @@ class StageScene:
         """Return a circle around the visible scene."""
         if self.photographs is None:
             return gaussian_turntable(self.gaussians, up_world=up_world)
-        return turntable_of_views(self.photographs)
+        return turntable_of_views(self.photographs, self.gaussians)
 
     def ray_of_pixel(
         self, name: str, pixel: tuple[float, float]
@@ -91,7 +91,7 @@ def first_stage_layout(scene: StageScene, up_world: Float64[np.ndarray, "3"] | N
         up_world: the direction that the user says is up; None for that of the photographs, or -y.
 
     Raises:
-        ConfigError: the cameras of the photographs share no centre or no up direction.
+        ConfigError: the cameras of the photographs share no up direction.
     """
     table = scene.turntable(up_world)
     if scene.photographs is None:

@@ -71,7 +71,7 @@ def orbit_cameras(
         frames: number of cameras.
 
     Raises:
-        ConfigError: the cameras of the photographs share no centre or no up direction.
+        ConfigError: the cameras of the photographs share no up direction.
     """
     table = _turntable(gaussians, viewpoints, lens, orbit)
     return turntable_cameras(table, frames, lens.width_px, lens.height_px, lens.fov_y_degrees)
@@ -108,7 +108,7 @@ def _turntable(
             elevation_degrees=ELEVATION_DEGREES if elevation is None else elevation,
         )
     else:
-        table = turntable_of_views(viewpoints)
+        table = turntable_of_views(viewpoints, gaussians)
     if orbit.target_world is not None:
         table = replace(table, centre_world=orbit.target_world)
     # of the photographs or the fitted circle, measured from the middle

@@ -3,6 +3,7 @@
 Poses are camera-to-world matrices in float64; cameras look along +z, x right, y down.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,8 @@ from jaxtyping import Float64
 
 from octasplat.engine.core.errors import ConfigError
 
+_LEAST_EIGENVALUE = 1e-5
+"""Of the mean of I - d d^T over viewing directions d; it vanishes where all are parallel."""
 _WRAPPED_KEYS = 3
 """How many keys of a closed path are repeated before and after it, so that its ends join smoothly."""
 
@@ -112,12 +115,20 @@ def fit_turntable(
     camera_centres: Float64[np.ndarray, "n 3"],
     camera_forwards: Float64[np.ndarray, "n 3"],
     camera_ups: Float64[np.ndarray, "n 3"],
+    *,
+    centre_if_parallel: Callable[[], Float64[np.ndarray, "3"]] | None = None,
 ) -> Turntable:
     """Return the circle around what the cameras look at, at their typical distance and height.
 
     The centre is the point nearest to all viewing axes, by least squares with weights that fall with the
     distance, so that a few cameras that look elsewhere do not move it. Up is the mean of the cameras' up
     directions (their -y axes); radius and height are medians over the cameras.
+
+    Args:
+        camera_centres: In the world.
+        camera_forwards: Viewing directions.
+        camera_ups: Up directions.
+        centre_if_parallel: Gives the centre where all cameras look the same way; None refuses these.
 
     Raises:
         ConfigError: There is no such point or direction: too few cameras, or all look the same way.
@@ -127,7 +138,10 @@ def fit_turntable(
     if len(forwards) < 2 or not np.linalg.norm(up) > 1e-3 * len(forwards):
         raise ConfigError("These cameras share no up direction; give the turntable's centre and up yourself.")
     up = up / np.linalg.norm(up)
-    centre = _nearest_to_axes(camera_centres, forwards)
+    if centre_if_parallel is not None and _are_parallel(forwards):
+        centre = centre_if_parallel()
+    else:
+        centre = _nearest_to_axes(camera_centres, forwards)
     offsets = camera_centres - centre
     heights = offsets @ up
     across = offsets - heights[:, None] * up
@@ -224,19 +238,29 @@ def _catmull_rom_velocities(
     return np.concatenate([2 * slopes[:1] - inner[:1], inner, 2 * slopes[-1:] - inner[-1:]])
 
 
+def _are_parallel(forwards: Float64[np.ndarray, "n 3"]) -> bool:
+    """Return whether no point is determined as the one nearest to all axes."""
+    return bool(np.linalg.eigvalsh(_across(forwards).mean(axis=0))[0] < _LEAST_EIGENVALUE)
+
+
+def _across(forwards: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3 3"]:
+    """Return I - d d^T for each direction d, which maps to the part across it."""
+    projections: Float64[np.ndarray, "n 3 3"] = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]
+    return projections
+
+
 def _nearest_to_axes(
     centres: Float64[np.ndarray, "n 3"], forwards: Float64[np.ndarray, "n 3"]
 ) -> Float64[np.ndarray, "3"]:
     """Return the point with the least sum of distances to lines, by reweighted least squares."""
-    # I - d d^T: distance vectors to the line
-    across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]
+    across = _across(forwards)  # distance vectors to the line
     projected = np.einsum("nij,nj->ni", across, centres)
     extent = float(np.linalg.norm(np.ptp(centres, axis=0)))
     weights = np.ones(len(centres))
     point = np.zeros(3)
     for _ in range(30):
         matrix = np.einsum("n,nij->ij", weights, across) / weights.sum()
-        if np.linalg.eigvalsh(matrix)[0] < 1e-5:  # all axes parallel: the smallest eigenvalue vanishes
+        if np.linalg.eigvalsh(matrix)[0] < _LEAST_EIGENVALUE:
             raise ConfigError(
                 "The cameras all look the same way, so that they have no common centre; "
                 "give the turntable's centre yourself."

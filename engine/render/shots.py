@@ -88,15 +88,23 @@ def turntable_cameras(
     )
 
 
-def turntable_of_views(viewpoints: Viewpoints) -> Turntable:
+def turntable_of_views(viewpoints: Viewpoints, gaussians: FlatGaussians) -> Turntable:
     """Return the turntable that fits the photographs' cameras.
 
+    Its centre is the middle of the visible Gaussians where all cameras look the same way.
+
     Raises:
-        ConfigError: the cameras share no centre or no up direction.
+        ConfigError: the cameras share no up direction.
     """
     rotations = np.stack([view.rotation_cam_from_world for view in viewpoints.views])
     centres = np.stack([view.origin_world for view in viewpoints.views])
-    return fit_turntable(centres, rotations[:, 2], -rotations[:, 1])  # camera axes: +z is forward, -y is up
+    ups = -rotations[:, 1]  # camera axes: +z is forward, -y is up
+    return fit_turntable(
+        centres,
+        rotations[:, 2],
+        ups,
+        centre_if_parallel=lambda: visible_bounds(gaussians, ups.sum(axis=0)).centre_world,
+    )
 
 
 def fov_y_of_views(viewpoints: Viewpoints) -> float:

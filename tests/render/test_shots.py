@@ -1,6 +1,7 @@
 """Cameras for series of images, from photographs or from nothing but Gaussians."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -42,9 +43,24 @@ def test_rays_of_views_are_those_of_training(scene_folder, tmp_path):
 
 def test_turntable_of_a_scene_goes_round_its_table(scene_folder):
     scene = load_dataset_model(scene_folder)
-    table = turntable_of_views(scene)
+    table = turntable_of_views(scene, cloud(np.eye(3), np.zeros(3)))
     np.testing.assert_allclose(table.up_world, [0, 0, 1], atol=0.1)
     assert np.linalg.norm(table.centre_world) < table.radius / 2
+
+
+def test_cameras_that_all_look_the_same_way_go_round_the_middle_of_the_scene(scene_folder):
+    scene = load_dataset_model(scene_folder)
+    forward = np.diag([1.0, -1.0, -1.0])  # they look along -z with y up
+    views = tuple(
+        replace(view, rotation_cam_from_world=forward, translation_cam_from_world=-forward @ [k, 2.0, 5.0])
+        for k, view in enumerate(scene.views)
+    )
+    middle = np.array([3.0, 1.0, -4.0])
+    gaussians = cloud(middle + np.random.default_rng(0).uniform(-1, 1, (500, 3)), np.full(500, 4.0))
+    table = turntable_of_views(replace(scene, views=views), gaussians)
+    np.testing.assert_allclose(table.centre_world, middle, atol=0.1)
+    np.testing.assert_allclose(table.up_world, [0, 1, 0], atol=1e-9)
+    assert table.radius > 8 and table.height == pytest.approx(1.0, abs=0.1)
 
 
 def test_field_of_view_of_a_scene(scene_folder):
