@@ -6,8 +6,8 @@ from typing import Any
 
 from octasplat.workers.db.rows import Job
 
-MAX_PACE = 4.0
-"""So much slower or faster than estimated stages to come may be; the end of a stage says little of them."""
+MAX_PACE = 2.0
+"""So much slower or faster than estimated stages to come may be; estimates are right within that factor."""
 _UNEVEN_STAGES = ("matches",)
 """Stages of which most steps take no time, as those of pairs that are not alike: their share says nothing."""
 _BEFORE_TRAINING = ("check", "read", "features", "matches", "placing", "lenses")

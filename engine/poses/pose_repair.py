@@ -46,12 +46,12 @@ def repair_misplaced(request: PoseSearchRequest, given: GivenModel, progress: Ev
         progress: hears the progress.
     """
     pycolmap.logging.minloglevel = 2  # its warnings are of use to nobody here
-    hearing = _PoseVerifier(request, given, progress)
     others = np.setdiff1d(np.arange(len(given.names)), np.array(given.doubtful, dtype=np.int64)).tolist()
     asked = _evenly_spaced(others, request.config.first_witnesses)
+    more = _evenly_spaced([k for k in others if k not in asked], MAX_WITNESSES - len(asked))
+    hearing = _PoseVerifier(request, given, sorted({*given.doubtful, *asked, *more}), progress)
     hearing.match_with(given.doubtful, asked)
     left = [k for k in given.doubtful if not hearing.is_consistent(k)]
-    more = _evenly_spaced([k for k in others if k not in asked], MAX_WITNESSES - len(asked))
     if left and more:
         hearing.match_with(left, more)
     moved: dict[int, Pose] = {}
@@ -72,27 +72,39 @@ def repair_misplaced(request: PoseSearchRequest, given: GivenModel, progress: Ev
 class _PoseVerifier:
     """Checks doubtful poses against the matches with other photographs.
 
+    Photographs are those of the given model, by their numbers there. The database has those alone that are
+    read here, numbered from 1 on in the same order.
+
+    Args:
+        request: says where to work and what with.
+        given: the model, and the photographs in doubt.
+        read: photographs that may be matched, in order.
+        progress: hears the progress.
+
     Attributes:
         model: as it is given.
         images: of the model, by photograph.
     """
 
-    def __init__(self, request: PoseSearchRequest, given: GivenModel, progress: EventListener) -> None:
+    def __init__(
+        self, request: PoseSearchRequest, given: GivenModel, read: Sequence[int], progress: EventListener
+    ) -> None:
         self.model: Any = load_model(given.model).reconstruction
         by_name = {image.name: image for image in self.model.images.values()}
         self.images: dict[int, Any] = {k: by_name[name] for k, name in enumerate(given.names)}
         self._config, self._tell, self._threads = request.config, progress, request.threads or -1
         self._doubtful = frozenset(given.doubtful)
         self._photographs, self._database = request.work / "photographs", request.work / "database.db"
-        self._aliases = link_photographs(request.images, request.names, self._photographs, progress)
-        infos = [read_image_info(request.images / name) for name in request.names]
+        self._place = {k: place for place, k in enumerate(read)}
+        names = [request.names[k] for k in read]
+        self._aliases = link_photographs(request.images, names, self._photographs, progress)
+        infos = [read_image_info(request.images / name) for name in names]
         self._sizes_px = [(info.width_px, info.height_px) for info in infos]
         self._one_camera = len(set(self._sizes_px)) == 1
         self._matched_pairs: set[int] = set()
-        read = create_database(self._database, self._photographs, self._aliases, one_camera=self._one_camera)
-        if read != self._aliases:  # those after one that is missing would be others
-            pairs = zip(request.names, self._aliases, strict=True)
-            unread = [name for name, alias in pairs if alias not in read]
+        made = create_database(self._database, self._photographs, self._aliases, one_camera=self._one_camera)
+        if made != self._aliases:  # those after one that is missing would be others
+            unread = [name for name, alias in zip(names, self._aliases, strict=True) if alias not in made]
             raise DatasetError(f"COLMAP cannot read {', '.join(unread[:3])}.")
 
     def match_with(self, doubtful: Sequence[int], witnesses: Sequence[int]) -> None:
@@ -102,7 +114,7 @@ class _PoseVerifier:
             extract_features(
                 self._database,
                 self._photographs,
-                [self._aliases[k] for k in new],
+                [self._aliases[self._place[k]] for k in new],
                 self._config,
                 thorough=False,
                 one_camera=self._one_camera,
@@ -110,7 +122,8 @@ class _PoseVerifier:
                 on_count=at,
             )
         self._matched_pairs.update(new)
-        pairs = sorted((min(a, b), max(a, b)) for a in doubtful for b in witnesses)
+        places = [(self._place[a], self._place[b]) for a in doubtful for b in witnesses]
+        pairs = sorted((min(pair), max(pair)) for pair in places)
         with progress_stage(MATCHES, len(pairs), self._tell) as at:
             match_pairs(
                 self._database,
@@ -141,8 +154,8 @@ class _PoseVerifier:
     def _matches(self, k: int) -> Matches | None:
         # other doubtful photographs say nothing reliable
         asked = {k, *self._matched_pairs} - (self._doubtful - {k})
-        images = {number + 1: self.images[number] for number in asked}
-        return collect_matches(k + 1, self.model, images, self._database, self._sizes_px)
+        images = {self._place[other] + 1: self.images[other] for other in asked}
+        return collect_matches(self._place[k] + 1, self.model, images, self._database, self._sizes_px)
 
     def _given_pose(self, k: int) -> Pose:
         pose = self.images[k].cam_from_world()
@@ -150,7 +163,8 @@ class _PoseVerifier:
 
     def _inlier_distance(self, k: int) -> float:
         """Return the distance at which a match is an inlier, in units of the focal length."""
-        camera, (width_px, height_px) = self.model.cameras[self.images[k].camera_id], self._sizes_px[k]
+        camera = self.model.cameras[self.images[k].camera_id]
+        width_px, height_px = self._sizes_px[self._place[k]]
         shrunk = min(1.0, MAX_IMAGE_SIDE_PX / max(width_px, height_px))
         return float(INLIER_DISTANCE_PX * camera.width / width_px / shrunk / camera.mean_focal_length())
 

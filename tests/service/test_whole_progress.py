@@ -38,8 +38,8 @@ def test_stages_are_weighed_by_estimated_times(
     ("stage", "step", "seconds_left", "whole_left"),
     [
         ("features", 50, 10.0, 10.0 + 2.0 * 500.0),  # half as fast as estimated
-        ("features", 99, 2.0, 2.0 + 4.0 * 500.0),  # 20 times as slow: a noise of the last step
-        ("features", 50, 0.1, 0.1 + 0.25 * 500.0),
+        ("features", 99, 2.0, 2.0 + 2.0 * 500.0),  # 20 times as slow: a noise of the last step
+        ("features", 50, 0.1, 0.1 + 0.5 * 500.0),
         ("matches", 97, 585.0, 585.0 + 400.0),  # what the quick look has ruled out took no time
     ],
 )
