@@ -44,7 +44,9 @@ from octasplat.engine.poses.photographs import photographs_of_scene, photographs
 from octasplat.engine.poses.stored_search import (
     SEARCH_FILE,
     STORED_FROM,
+    is_stopped_search,
     search_folder,
+    search_record,
     store_stopped_search,
 )
 
@@ -73,7 +75,8 @@ def find_poses(
     placed. Where photographs are left out, the last three may come a second time; a search that goes on has
     no ``read``, but for photographs in formats that COLMAP does not read, which are counted first. The same
     photographs give the same files on any number of threads. A result that is there already is taken as it
-    is. A search that was stopped goes on with the features and matches that it had found.
+    is. A search that was stopped goes on with the features and matches that it had found, unless it was
+    begun by a version with other results, of which a warning tells.
 
     Args:
         images: folder of photographs, also in folders below it if it is called ``images``.
@@ -103,8 +106,7 @@ def find_poses(
                 f"the results, or remove {output} to find them anew."
             )
         return
-    search = {"photographs_sha256": sha256, "config": config.model_dump(mode="json")}
-    with _work_folder(output, search) as work:
+    with _work_folder(output, search_record(sha256, config), progress) as work:
         request = PoseSearchRequest(
             images=images.resolve(), names=tuple(names), work=work.resolve(), config=config, threads=threads
         )
@@ -229,16 +231,19 @@ def adjust_principal_points(
 
 
 @contextmanager
-def _work_folder(output: Path, search: Mapping[str, Any] | None = None) -> Iterator[Path]:
+def _work_folder(
+    output: Path, search: Mapping[str, Any] | None = None, progress: EventListener = ignore_events
+) -> Iterator[Path]:
     """Yield a hidden folder beside ``output``, removed when the block ends.
 
     Args:
         output: place of the result.
         search: what is searched for. The folder of the same search that was stopped is yielded as it was,
             and a block that is stopped keeps it. None always begins with an empty folder.
+        progress: told why a search that was stopped begins anew.
     """
     work = search_folder(output)
-    if search is None or _stopped_search(work) != search:
+    if search is None or not is_stopped_search(work, search, progress):
         shutil.rmtree(work, ignore_errors=True)
         work.mkdir(parents=True)
         if search is not None:
@@ -252,15 +257,6 @@ def _work_folder(output: Path, search: Mapping[str, Any] | None = None) -> Itera
     finally:
         if not is_kept:
             shutil.rmtree(work, ignore_errors=True)
-
-
-def _stopped_search(work: Path) -> dict[str, Any] | None:
-    """Return what the search was for that left a folder; None if there is none."""
-    try:
-        search: dict[str, Any] = json.loads((work / SEARCH_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    return search
 
 
 class _ColmapProcess:

@@ -8,12 +8,15 @@ import json
 import os
 import sqlite3
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
+from typing import Any
 
-from octasplat.engine.core.events import CheckpointWritten, EventListener
+from octasplat.engine.core import versions
+from octasplat.engine.core.events import CheckpointWritten, EventListener, Warned
 from octasplat.engine.core.writing import write_json
+from octasplat.engine.poses.config import PosesConfig
 from octasplat.engine.poses.pairs import Pair
 
 DATABASE = "database.db"
@@ -30,6 +33,40 @@ _STORE_SECONDS = 600.0
 def search_folder(output: Path) -> Path:
     """Return the hidden folder beside ``output`` in which poses are searched that are written there."""
     return output.with_name(f".{output.name}.work")
+
+
+def search_record(photographs_sha256: str, config: PosesConfig) -> dict[str, Any]:
+    """Return what tells a search from any other, for :data:`SEARCH_FILE`."""
+    return {
+        "photographs_sha256": photographs_sha256,
+        "config": config.model_dump(mode="json"),
+        "results": versions.RESULTS_VERSION,
+    }
+
+
+def is_stopped_search(work: Path, search: Mapping[str, Any], progress: EventListener) -> bool:
+    """Return whether the same search has left a folder; tell if it was one of another version.
+
+    Args:
+        work: the folder.
+        search: as :func:`search_record` has it.
+        progress: told that a search begins anew whose features and matches may be others by now.
+    """
+    try:
+        left = json.loads((work / SEARCH_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    if left == search:
+        return True
+    of_version = left.get("results") if isinstance(left, dict) else search["results"]
+    if of_version != search["results"]:  # former versions did not say theirs
+        progress(
+            Warned(
+                "The search for poses was begun by another version of octasplat, which may have found other "
+                "features and matches, so it begins anew."
+            )
+        )
+    return False
 
 
 def adopt_stored_database(work: Path) -> None:

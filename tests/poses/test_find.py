@@ -15,6 +15,7 @@ import pycolmap
 import pytest
 from jaxtyping import Float64
 
+from octasplat.engine.core import versions
 from octasplat.engine.core.errors import CancelledError, ColmapCrashError, DatasetError
 from octasplat.engine.core.events import (
     CheckpointWritten,
@@ -29,7 +30,12 @@ from octasplat.engine.poses import stored_search
 from octasplat.engine.poses.find_poses import PosesConfig, find_poses
 from octasplat.engine.poses.photographs import photographs_sha256
 from octasplat.engine.poses.search import PoseSearch
-from octasplat.engine.poses.stored_search import SEARCH_FILE, STORED_SEARCH_FILES, search_folder
+from octasplat.engine.poses.stored_search import (
+    SEARCH_FILE,
+    STORED_SEARCH_FILES,
+    search_folder,
+    search_record,
+)
 from octasplat.engine.render.image_files import write_png
 from tests.support.neighbouring_photographs import write_neighbours
 
@@ -185,6 +191,31 @@ def test_find_poses_should_stop_cancels(taken: Photographs, tmp_path: Path) -> N
     assert [path.name for path in tmp_path.iterdir()] == [".out.work"]
 
 
+@pytest.mark.parametrize("results", [versions.RESULTS_VERSION, versions.RESULTS_VERSION - 1, None])
+def test_stopped_search_of_another_version_begins_anew(
+    taken: Photographs, tmp_path: Path, results: int | None
+) -> None:
+    events = list[Event]()
+
+    def stop() -> None:
+        with pytest.raises(CancelledError):
+            find_poses(taken.folder, tmp_path / "out", progress=events.append, should_stop=lambda: True)
+
+    stop()
+    work = search_folder(tmp_path / "out")
+    record = json.loads((work / SEARCH_FILE).read_text())
+    (work / "found").write_text("features")
+    of_version = {} if results is None else {"results": results}
+    left = {name: value for name, value in record.items() if name != "results"} | of_version
+    (work / SEARCH_FILE).write_text(json.dumps(left))
+    stop()
+    is_same = results == versions.RESULTS_VERSION
+    assert (work / "found").exists() == is_same
+    warnings = [event.message for event in events if isinstance(event, Warned)]
+    assert len(warnings) == (not is_same) and all("begins anew" in message for message in warnings)
+    assert json.loads((work / SEARCH_FILE).read_text()) == record
+
+
 @pytest.mark.exhaustive
 def test_stopped_search_goes_on_with_its_features_and_matches(
     taken: Photographs, found_at_once: Found, tmp_path: Path
@@ -235,13 +266,8 @@ def test_search_goes_on_in_another_folder_from_what_was_stored(
             for name in STORED_SEARCH_FILES:
                 if (work / name).exists():
                     shutil.copyfile(work / name, search_folder(elsewhere) / name)
-            write_json(
-                search_folder(elsewhere) / SEARCH_FILE,
-                {
-                    "photographs_sha256": photographs_sha256(taken.folder, names),
-                    "config": PosesConfig().model_dump(mode="json"),
-                },
-            )
+            record = search_record(photographs_sha256(taken.folder, names), PosesConfig())
+            write_json(search_folder(elsewhere) / SEARCH_FILE, record)
             stored.append(event.iteration)
 
     PoseSearch(taken.folder, names, work, PosesConfig(), 1, store).run(tmp_path / "found")
