@@ -39,7 +39,8 @@ from benchmarks.queue_deliveries import QUEUE, empty_database
 from octasplat.engine.core import versions
 from octasplat.workers.db.connections import Pool, open_pool
 from octasplat.workers.queue.attempts import Attempt, FencedError
-from octasplat.workers.queue.block_jobs import NewBlock, files_from_others, settle_root
+from octasplat.workers.queue.block_jobs import NewBlock, settle_root
+from octasplat.workers.queue.block_results import files_from_others
 from octasplat.workers.queue.claims import claim
 from octasplat.workers.queue.fair_share import choose_job
 from octasplat.workers.queue.job_results import ResultFile

@@ -17,10 +17,10 @@ from octasplat.workers.queue.block_jobs import (
     NewBlock,
     blocks_of,
     cancel_job,
-    files_from_others,
     settle_root,
     unsettled_roots,
 )
+from octasplat.workers.queue.block_results import files_from_others
 from octasplat.workers.queue.fair_share import choose_job
 from octasplat.workers.queue.job_results import ResultFile
 from octasplat.workers.queue.jobs import create_job, delete_job, list_jobs, lock_blocks, retry_job
@@ -29,6 +29,9 @@ from octasplat.workers.queue.storage_leases import storage_lease
 from octasplat.workers.queue.usage_figures import running_by_queue
 from octasplat.workers.storage.errors import BlobNotFoundError
 from octasplat.workers.storage.local import LocalStorage
+from octasplat.workers.worker.checkpoint import Checkpoint, plan_digest
+from octasplat.workers.worker.job_inputs import read_inputs
+from octasplat.workers.worker.job_kinds import get_job_kind
 from tests.support.queue_jobs import NEW, SLIPS, claimed, fetched
 
 PLANNED = "f" * 64
@@ -41,7 +44,8 @@ def checkpoint() -> dict[str, object]:
 
 async def start(pool: Pool, folder: Path, attempt: Attempt, numbers: Sequence[int] = (1, 2)) -> Job:
     """Let an attempt plan blocks; return the job that waits for them."""
-    blocks = [NewBlock(n, 10 * n, {"number": n, "iterations": 10 * n, "plan": PLANNED}) for n in numbers]
+    plan = plan_digest(Checkpoint.from_row(checkpoint()))
+    blocks = [NewBlock(n, 10 * n, {"number": n, "iterations": 10 * n, "plan": plan}) for n in numbers]
     async with storage_lease(pool, LocalStorage(folder, floor_bytes=0)) as lease:
         await attempt.start_blocks(
             SLIPS, checkpoint(), "toy", blocks, lease, first_steps=5, total_steps=5 + 10 * sum(numbers)
@@ -215,6 +219,39 @@ async def test_results_lost_twice_fail_with_the_name_of_the_block(conninfo: str,
                 assert [file.sha256[0] for file in await files_from_others(connection, merge.job)] == ["1"]
             root = await start(pool, folder, merge)
             assert [block.state for block in await children(pool, root.id)] == ["succeeded", "queued"]
+
+
+async def test_results_of_another_plan_are_not_merged(conninfo: str, folder: Path) -> None:
+    """A job that began anew, as under a version with other results, and lost its worker as it planned."""
+    kind = get_job_kind("reconstruct")
+
+    async def taken_over(attempt: Attempt) -> list[str]:
+        async with attempt.pool.connection() as connection:
+            inputs = await read_inputs(connection, attempt.job, kind, kind.resolve({}))
+        return [file.path for file in inputs.others]
+
+    async with open_pool(conninfo, max_size=6) as pool:
+        root = await start(pool, folder, await claimed(pool))
+        for block in await children(pool, root.id):
+            result = ResultFile(f"blocks/block_00{block.options['number']}/best.npz", "1" * 64, 1, "x")
+            await (await claimed(pool, block)).succeed([result], job_queue=SLIPS)
+        merge = await claimed(pool, await fetched(pool, root.id))
+        assert len(await taken_over(merge)) == 2
+        files = [
+            {
+                "path": "run/blocks/coarse/checkpoints/iteration_0000010.npz",
+                "sha256": "a" * 64,
+                "size_bytes": 1,
+            }
+        ]
+        await merge.record_checkpoint({**checkpoint(), "files": files}, is_progress=True)
+        await merge.requeue(SLIPS, "its worker stops")
+        again = await claimed(pool, await fetched(pool, root.id))
+        assert await taken_over(again) == []
+        # planned as before after all: what the blocks have made is kept
+        root = await start(pool, folder, again)
+        assert (await settle(pool, root.id)).state == "queued"
+        assert len(await taken_over(await claimed(pool, await fetched(pool, root.id)))) == 2
 
 
 async def test_whole_that_cannot_be_merged_does_not_begin_anew_for_ever(conninfo: str, folder: Path) -> None:

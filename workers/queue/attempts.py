@@ -20,11 +20,10 @@ from octasplat.workers.queue.block_jobs import (
     ROOT,
     NewBlock,
     add_live_scene_event,
-    drop_lost_blocks,
-    forget_block_results,
     release_needs,
     start_blocks,
 )
+from octasplat.workers.queue.block_results import drop_lost_blocks, forget_block_results
 from octasplat.workers.queue.job_endings import MAX_RECOVERIES, count_requeues, end_job, recover_attempt
 from octasplat.workers.queue.job_results import ResultFile, replace_artifacts, result_digests
 from octasplat.workers.queue.jobs import get_job, lock_blocks, requeue_job

@@ -10,9 +10,10 @@ from pydantic import BaseModel
 from octasplat.workers.db.connections import Connection
 from octasplat.workers.db.datasets import files_of, get_dataset
 from octasplat.workers.db.rows import Artifact, Dataset, DatasetFile, Job
-from octasplat.workers.queue.block_jobs import files_from_others
+from octasplat.workers.queue.block_results import files_from_others
 from octasplat.workers.queue.jobs import artifacts_of, get_job
 from octasplat.workers.storage.trees import TreeFile
+from octasplat.workers.worker.checkpoint import Checkpoint, plan_digest
 from octasplat.workers.worker.job_kinds import JobKind
 from octasplat.workers.worker.start_files import start_choices
 from octasplat.workers.worker.task import RUN_FOLDER
@@ -57,9 +58,14 @@ async def read_inputs(connection: Connection, job: Job, kind: JobKind, options: 
         photographs=await files_of(connection, job.dataset_id) if job.dataset_id else [],
         artifacts=artifacts,
         starts=start_choices(source, artifacts) if begins and source is not None else [],
-        others=await files_from_others(connection, job) if job.role is not None else [],
+        others=await files_from_others(connection, job, plan=_plan_of(job)) if job.role is not None else [],
         named=await files_of(connection, job.files_id) if job.files_id else [],
     )
+
+
+def _plan_of(job: Job) -> str:
+    """Return the digest of the plan of blocks that a job goes on with."""
+    return "" if job.checkpoint is None else plan_digest(Checkpoint.from_row(job.checkpoint))
 
 
 def fetch_photographs(
