@@ -2,16 +2,23 @@
 
 import signal
 import uuid
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import psycopg
 import pytest
 
+from octasplat.workers.db.connections import open_pool
 from octasplat.workers.db.errors import ConflictError
 from octasplat.workers.db.quotas import usage_of
 from octasplat.workers.db.rows import Job
-from octasplat.workers.queue.block_jobs import blocks_of
+from octasplat.workers.queue.block_jobs import NewBlock, blocks_of
 from octasplat.workers.queue.jobs import artifacts_of, delete_job, list_jobs
+from octasplat.workers.queue.storage_leases import storage_lease
+from octasplat.workers.storage.local import LocalStorage
+from octasplat.workers.worker.outcomes import OutcomeWriter
+from tests.support.queue_jobs import SLIPS, claimed, fetched
 from tests.support.worker_harness import WorkerHarness
 
 KINDS: dict[str, Any] = {"KIND_MODULES": '["tests.support.toy_kind", "tests.support.block_toys"]'}
@@ -129,6 +136,20 @@ def test_failed_block_fails_the_whole_and_a_retry_keeps_what_succeeded(bench: Wo
 
 
 @pytest.mark.exhaustive
+def test_retry_under_a_version_with_a_further_setting_keeps_what_succeeded(bench: WorkerHarness) -> None:
+    bench.worker(**KINDS)
+    root = submit(bench, refuse=2)
+    bench.wait_until_finished(root)
+    with psycopg.connect(bench.conninfo) as connection:  # as blocks of the version before that setting
+        connection.execute("UPDATE jobs SET options = options - 'steps' WHERE root_id = %s", [root])
+    bench.open_gate()
+    bench.retry(root)
+    assert bench.wait_until_finished(root).state == "succeeded"
+    assert bench.results(root) == {"sum.txt": DONE}
+    assert [child.attempt for child in blocks(bench, root)] == [1, 2, 1]
+
+
+@pytest.mark.exhaustive
 def test_cancelling_ends_all_blocks_and_a_retry_goes_on(bench: WorkerHarness) -> None:
     bench.worker(**KINDS)
     root = submit(bench, hold=1)
@@ -178,3 +199,27 @@ def test_lost_database_in_the_middle_is_outlived(bench: WorkerHarness) -> None:
     bench.worker(name="after", **KINDS)  # in case that the first ends over it, to be started again
     assert bench.wait_until_finished(root).state == "succeeded"
     assert bench.results(root) == {"sum.txt": DONE}
+
+
+async def test_worker_that_ends_with_the_last_block_leaves_the_whole_queued(
+    conninfo: str, tmp_path: Path
+) -> None:
+    async with open_pool(conninfo, max_size=4) as pool:
+        whole = await claimed(pool)
+        async with storage_lease(pool, LocalStorage(tmp_path, floor_bytes=0)) as lease:
+            await whole.start_blocks(
+                SLIPS, {"files": []}, "toy", [NewBlock(1, 5, {"number": 1})], lease,
+                first_steps=0, total_steps=5,
+            )  # fmt: skip
+        async with pool.connection() as connection:
+            [block] = await blocks_of(connection, [whole.job.id])
+        context: Any = SimpleNamespace(
+            job_queue=SLIPS,
+            settings=SimpleNamespace(heartbeat_seconds=5.0),
+            host_health=SimpleNamespace(record_success=lambda: None),
+        )
+        workspace: Any = SimpleNamespace(read_psnr=lambda _results: None)
+        unused: Any = None
+        writer = OutcomeWriter(await claimed(pool, block), context, workspace, unused, unused, "")
+        await writer.succeed([])
+        assert (await fetched(pool, whole.job.id)).state == "queued"

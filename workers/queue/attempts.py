@@ -18,6 +18,7 @@ from octasplat.workers.db.quotas import NO_QUOTA, Quota, check_bytes
 from octasplat.workers.db.rows import Job
 from octasplat.workers.queue.block_jobs import (
     ROOT,
+    CompleteOptions,
     NewBlock,
     add_live_scene_event,
     release_needs,
@@ -192,6 +193,7 @@ class Attempt:
         *,
         first_steps: int,
         total_steps: int,
+        complete: CompleteOptions = dict,
     ) -> None:
         """Queue the blocks of the job, which ends the attempt; a job being cancelled ends instead.
 
@@ -203,6 +205,7 @@ class Attempt:
             lease: under which the checkpoint was stored.
             first_steps: see :func:`octasplat.workers.queue.block_jobs.start_blocks`.
             total_steps: likewise.
+            complete: likewise.
 
         Raises:
             StorageUnavailableError: ``lease`` was given up.
@@ -221,8 +224,9 @@ class Attempt:
             )
             await check_bytes(connection, job.owner, self.quota)
             await start_blocks(
-                connection, job_queue, job, kind, blocks, first_steps=first_steps, total_steps=total_steps
-            )
+                connection, job_queue, job, kind, blocks,
+                first_steps=first_steps, total_steps=total_steps, complete=complete,
+            )  # fmt: skip
 
     async def drop_lost_blocks(self, lost: Collection[str]) -> None:
         """Let blocks be trained again of whose results the store has lost contents of these digests.

@@ -9,7 +9,7 @@ Rows are locked in the order of the children's ids, and the root's after them.
 """
 
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,6 +24,8 @@ from octasplat.workers.queue.job_endings import end_job
 from octasplat.workers.queue.jobs import NewJob, create_jobs, get_job, lock_blocks, requeue_job
 from octasplat.workers.queue.protocol import JobQueue
 
+CompleteOptions = Callable[[Mapping[str, Any]], Mapping[str, Any] | None]
+"""Returns every option of a block as this version understands those given; None if it does not."""
 ROOT, BLOCK = "root", "block"
 """Roles of jobs in blocks; other jobs have none."""
 
@@ -52,10 +54,11 @@ async def start_blocks(
     *,
     first_steps: int,
     total_steps: int,
+    complete: CompleteOptions = dict,
 ) -> None:
     """Queue the blocks of a job, which waits for them from now on; the caller has locked both.
 
-    Blocks that an earlier attempt has queued are kept if their options are the same: those that succeeded
+    Blocks that an earlier attempt has queued are kept if their options mean the same: those that succeeded
     are not trained again.
 
     Args:
@@ -66,11 +69,13 @@ async def start_blocks(
         blocks: all of them.
         first_steps: iterations before the blocks, which are done.
         total_steps: iterations of the whole job.
+        complete: completes options of a block, which another version may have written.
     """
     kept: dict[int, Job] = {}
-    wanted = {block.number: dict(block.options) for block in blocks}
+    wanted = {block.number: complete(block.options) for block in blocks}
     for child in await blocks_of(connection, [root.id]):
-        if child.options == wanted.get(number := int(child.options["number"])):
+        number = int(child.options["number"])
+        if number in wanted and complete(child.options) == wanted[number]:
             kept[number] = child
         else:
             await connection.execute("DELETE FROM jobs WHERE id = %s", [child.id])

@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 import psycopg
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
 from octasplat.engine.core.errors import OctasplatError
 from octasplat.workers.db.quotas import QuotaExceededError
@@ -27,7 +27,7 @@ from octasplat.workers.storage.os_errors import is_disk_full
 from octasplat.workers.worker.checkpoint import plan_digest
 from octasplat.workers.worker.context import DatabaseLostError, WorkerContext
 from octasplat.workers.worker.heartbeat import DATABASE_ERRORS, Heartbeat
-from octasplat.workers.worker.job_kinds import JobKind
+from octasplat.workers.worker.job_kinds import JobKind, get_job_kind
 from octasplat.workers.worker.reporter import Reporter
 from octasplat.workers.worker.task import NO_SPACE_ERROR, BlocksPlanned
 from octasplat.workers.worker.workspace import Workspace
@@ -84,7 +84,8 @@ class OutcomeWriter:
         """Mark the job as succeeded with the ``results`` that are already published."""
         psnr = await asyncio.to_thread(self._workspace.read_psnr, results)
         try:
-            await self._write_with_retries(lambda: self._attempt.succeed(results, psnr))
+            job_queue = self._context.job_queue  # for what waited for the job
+            await self._write_with_retries(lambda: self._attempt.succeed(results, psnr, job_queue=job_queue))
         except QuotaExceededError as error:
             problem = {"type": "quota", "message": f"The results cannot be stored. {error}"}
             await self._write_with_retries(lambda: self._attempt.fail(problem, discarded=results))
@@ -250,6 +251,15 @@ class OutcomeWriter:
         self, planned: BlocksPlanned, kind: JobKind, options: BaseModel
     ) -> None:
         first = planned.first_iterations
+        block_kind = get_job_kind(kind.block_kind)
+
+        def complete(given: Mapping[str, Any]) -> Mapping[str, Any] | None:
+            try:
+                found: dict[str, Any] = block_kind.options.model_validate(given).model_dump(mode="json")
+            except ValidationError:
+                return None
+            return found
+
         while True:
             try:
                 async with storage_lease(self._attempt.pool, self._context.storage) as note:
@@ -269,6 +279,7 @@ class OutcomeWriter:
                         note,
                         first_steps=first,
                         total_steps=planned.total_iterations,
+                        complete=complete,
                     )
                     return
             except DATABASE_ERRORS as error:
