@@ -17,6 +17,7 @@ from octasplat.engine.blocks.block_merge import (
 from octasplat.engine.blocks.block_plan import Block, plan_blocks
 from octasplat.engine.blocks.piece_progress import PieceProgress
 from octasplat.engine.blocks.piece_settings import (
+    MARGIN,
     block_settings,
     coarse_settings,
     coarse_side_px,
@@ -24,7 +25,16 @@ from octasplat.engine.blocks.piece_settings import (
     fits_together,
 )
 from octasplat.engine.blocks.piece_training import BlockWork, Piece, is_piece_done, train_piece
-from octasplat.engine.blocks.scene_plan import COARSE, ScenePlan, block_name, has_plan, load_plan, save_plan
+from octasplat.engine.blocks.scene_plan import (
+    COARSE,
+    FINISH,
+    POLISH,
+    ScenePlan,
+    block_name,
+    has_plan,
+    load_plan,
+    save_plan,
+)
 from octasplat.engine.core.events import Noted
 from octasplat.engine.core.threads import use_threads
 from octasplat.engine.dataset import Dataset
@@ -88,7 +98,8 @@ def plan_scene(
     """
     if has_plan(work.folder):
         return load_plan(work.folder)
-    coarse = _train_coarse(work, count, tell, open_coarse).gaussians
+    tell.expect(_guess_iterations(work, count, most_gaussians))
+    coarse = _train_coarse(work, tell, open_coarse).gaussians
     blocks = plan_blocks(
         work.dataset, coarse, count, make_piece_tracer(work), lambda: stop_when_asked(work),
         min_side_px=min_tile_side_px(work.config),
@@ -159,14 +170,26 @@ def train_block(work: BlockWork, plan: ScenePlan, number: int, tell: PieceProgre
     train_piece(work, Piece(name, data, config, start, around), tell.of_piece(name))
 
 
-def _train_coarse(
-    work: BlockWork, count: int, tell: PieceProgress, open_coarse: Callable[[int], Dataset]
-) -> BestState:
+def _guess_iterations(work: BlockWork, count: int, most_gaussians: int | None) -> dict[str, int]:
+    """Return the iterations of all pieces of a scene that is not planned yet, of blocks that are alike."""
+    share = min(1.0, (1 + 2 * MARGIN) / count)
+    pixels = max(1, round(share * work.dataset.train_pixel_count))
+    config = block_settings(work.config, share, most_gaussians, is_finished_later=False)
+    lengths = [iteration_count(config, pixels)] * count
+    counts = [max_gaussian_count(config, pixels)] * count
+    is_finished_together = fits_together(work.config, counts, [share] * count, most_gaussians)
+    last = (
+        {FINISH: finish_iterations(lengths)}
+        if is_finished_together
+        else {POLISH: polish_iterations(work.config, pixels, 1.0)}
+    )
+    blocks = {block_name(number): length for number, length in enumerate(lengths, start=1)}
+    return {COARSE: coarse_settings(work.config).iterations, **blocks, **last}
+
+
+def _train_coarse(work: BlockWork, tell: PieceProgress, open_coarse: Callable[[int], Dataset]) -> BestState:
     """Return the coarse scene, trained on smaller photographs."""
     config = coarse_settings(work.config)
-    each = iteration_count(work.config, work.dataset.train_pixel_count)
-    names = {block_name(number): each for number in range(1, count + 1)}
-    tell.expect({COARSE: config.iterations, **names})
     side_px = coarse_side_px(int(view_sizes_px(work.dataset).max()))
     data = work.dataset if is_piece_done(work, COARSE) else open_coarse(side_px)
 

@@ -8,7 +8,7 @@ import pytest
 
 from octasplat.engine.blocks.scene_plan import has_plan, load_plan
 from octasplat.engine.core.errors import CheckpointError
-from octasplat.engine.core.events import Event, RunFinished
+from octasplat.engine.core.events import Event, RunFinished, TrainingProgress
 from octasplat.engine.pipeline import (
     BlockRequest,
     PlanBlocks,
@@ -73,10 +73,14 @@ def test_pieces_in_folders_of_their_own_give_the_same_bytes(
 
 
 def test_plan_is_read_as_it_was_written(scene: Path, tmp_path: Path) -> None:
+    events: list[Event] = []
     run = reconstruct(
-        scene, tmp_path / "run", CONFIG, threads=1, blocks=BlockRequest(count=3), steps=(PlanBlocks(),)
-    )
+        scene, tmp_path / "run", CONFIG, threads=1, blocks=BlockRequest(count=3), steps=(PlanBlocks(),),
+        progress=events.append,
+    )  # fmt: skip
     plan = load_plan(run / "blocks")
+    totals = {event.total_iterations for event in events if isinstance(event, TrainingProgress)}
+    assert totals == {sum(plan.expected_iterations().values())}  # known before it is planned
     assert len(plan.blocks) == 3 and plan.most_gaussians is None and plan.coarse_iterations == 20
     assert np.isinf(plan.blocks[0].core.low_world).any()
     assert plan.expected_iterations()["coarse"] == 20

@@ -26,7 +26,7 @@ from octasplat.workers.queue.job_results import ResultFile
 from octasplat.workers.queue.jobs import create_job, delete_job, list_jobs, lock_blocks, retry_job
 from octasplat.workers.queue.recovery import StalledAttempts, recover_stalled_jobs
 from octasplat.workers.queue.storage_leases import storage_lease
-from octasplat.workers.queue.usage_figures import running_by_queue
+from octasplat.workers.queue.usage_figures import running_by_queue, worked_seconds
 from octasplat.workers.storage.errors import BlobNotFoundError
 from octasplat.workers.storage.local import LocalStorage
 from octasplat.workers.worker.checkpoint import Checkpoint, plan_digest
@@ -219,6 +219,21 @@ async def test_results_lost_twice_fail_with_the_name_of_the_block(conninfo: str,
                 assert [file.sha256[0] for file in await files_from_others(connection, merge.job)] == ["1"]
             root = await start(pool, folder, merge)
             assert [block.state for block in await children(pool, root.id)] == ["succeeded", "queued"]
+
+
+async def test_job_that_waits_for_blocks_takes_no_time_of_workers(conninfo: str, folder: Path) -> None:
+    async with open_pool(conninfo, max_size=6) as pool:
+        root = await start(pool, folder, await claimed(pool))
+        async with pool.connection() as connection:
+            await connection.execute(
+                "UPDATE jobs SET started_at = now() - interval '1000 s' WHERE id = %s", [root.id]
+            )
+            await connection.execute(
+                "UPDATE job_events SET at = now() - interval '900 s' WHERE kind = 'blocks_queued'"
+            )
+            assert await worked_seconds(connection, "me") == pytest.approx(100, abs=5)
+            await cancel_job(connection, SLIPS, root.id)
+            assert await worked_seconds(connection, "me") == pytest.approx(100, abs=5)
 
 
 async def test_results_of_another_plan_are_not_merged(conninfo: str, folder: Path) -> None:

@@ -53,6 +53,7 @@ def test_blocks_are_trained_by_all_workers_and_one_job_is_seen(bench: WorkerHarn
     root = submit(bench)
     job = bench.wait_until_finished(root)
     assert (job.state, job.error, job.role, job.attempt) == ("succeeded", None, "root", 2)
+    assert (job.stage, job.step, job.total_steps) == ("train", 5 + 11 + 12 + 13, 5 + 11 + 12 + 13 + 5)
     assert bench.results(root) == {"sum.txt": DONE}
     children = blocks(bench, root)
     assert [child.options["number"] for child in children] == [1, 2, 3]

@@ -94,6 +94,36 @@ async def test_reporter_logs_progress_at_intervals(monkeypatch: pytest.MonkeyPat
     ]
 
 
+async def test_reporter_keeps_progress_until_the_training_goes_on() -> None:
+    """As of a job whose blocks are trained, which reads its photographs before it goes on behind them."""
+
+    class Log(SlowJournal):
+        def __init__(self) -> None:
+            super().__init__()
+            self.seen: list[tuple[object, object]] = []
+
+        async def set_progress(self, **progress: object) -> None:
+            self.seen.append((progress["stage"], progress["step"]))
+
+    journal = Log()
+    child = Reporter(journal, workspace=None)  # type: ignore[arg-type]
+    child.record_resume(Checkpoint(1, "train", 5, ()), keeps_progress=True)
+    trained = {"total_iterations": 900, "loss": 0.1, "psnr": 24.1, "gaussians": 1, "rays_per_second": 1.0,
+               "hits_per_ray": 5.0, "seconds": 1.0, "seconds_left": 1.0}  # fmt: skip
+    for event in (
+        {"kind": "stage_started", "stage": "load", "total_steps": 0},
+        {"kind": "stage_progress", "stage": "load", "step": 3, "total_steps": 7},
+        {"kind": "stage_finished", "stage": "load", "seconds": 1.0},
+        {"kind": "stage_started", "stage": "train", "total_steps": 200},
+        {"kind": "training_progress", "iteration": 700, **trained},
+        {"kind": "stage_started", "stage": "evaluate", "total_steps": 4},
+    ):
+        child.on_event(event)
+        await child._flush()
+    await child.finish()
+    assert journal.seen == [("train", 700), ("evaluate", 0)]
+
+
 async def test_reporter_says_which_file_was_not_stored(monkeypatch: pytest.MonkeyPatch) -> None:
     class Log(SlowJournal):
         pool = None

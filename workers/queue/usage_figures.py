@@ -47,13 +47,17 @@ async def running_by_worker(connection: Connection) -> dict[str, int]:
 
 
 async def worked_seconds(connection: Connection, owner: str) -> float:
-    """Return how long workers took for an owner's jobs, by the newest attempt of each."""
+    """Return how long workers took for an owner's jobs, by the newest attempt of each.
+
+    No worker has a job while it waits for its blocks, nor if it ends then: these are jobs by themselves.
+    """
     cursor = await connection.execute(
         """
-        SELECT coalesce(sum(extract(epoch FROM coalesce(finished_at, now()) - started_at)), 0)::float8
-            AS seconds
+        SELECT coalesce(sum(extract(epoch FROM CASE WHEN heartbeat_at IS NOT NULL
+            THEN coalesce(finished_at, now())
+            ELSE (SELECT max(at) FROM job_events WHERE job_id = jobs.id AND kind = 'blocks_queued')
+            END - started_at)), 0)::float8 AS seconds
         FROM jobs WHERE owner = %s AND started_at IS NOT NULL AND state <> 'queued'
-          AND (finished_at IS NOT NULL OR heartbeat_at IS NOT NULL)
         """,
         [owner],
     )

@@ -71,6 +71,7 @@ class Reporter:
         self._stages: tuple[str, ...] = ()
         self._time_left = TimeLeftEstimator()
         self._steps = 0
+        self._keeps_progress = False
         self._wanted_checkpoint: tuple[str, int] | None = None
         self._preview: dict[str, Any] | None = None
         self._live_scene: dict[str, Any] | None = None
@@ -92,9 +93,14 @@ class Reporter:
         self._stages = tuple(stages)
         self._events.append(("stages", {"stages": list(stages)}))
 
-    def record_resume(self, checkpoint: Checkpoint) -> None:
-        """Record what the attempt resumes from; only what is beyond it is progress."""
-        self._checkpoint = checkpoint
+    def record_resume(self, checkpoint: Checkpoint, *, keeps_progress: bool = False) -> None:
+        """Record what the attempt resumes from; only what is beyond it is progress.
+
+        Args:
+            checkpoint: is resumed from.
+            keeps_progress: leave the job as far as its row says until its training goes on behind that.
+        """
+        self._checkpoint, self._keeps_progress = checkpoint, keeps_progress
         self.add_note(f"Goes on from step {checkpoint.step} of {checkpoint.stage}")
 
     def log(self, line: str) -> None:
@@ -126,27 +132,31 @@ class Reporter:
         if kind == "stage_started":
             self._stage, self._time_left = event["stage"], TimeLeftEstimator()
             self._steps = int(event["total_steps"])
-            self._progress = {"stage": self._stage, "step": 0, "total_steps": self._steps or None}
+            self._set_progress({"stage": self._stage, "step": 0, "total_steps": self._steps or None})
         elif kind == "kernels_compiled":
             self._time_left.leave_out(float(event["seconds"]))
         elif kind == "stage_progress":
             self._on_stage_progress(event)
         elif kind == "training_progress":
             self._steps = int(event["total_iterations"])  # which a time decides, and an early end changes
-            self._progress = {
-                "stage": self._stage,
-                "step": event["iteration"],
-                "total_steps": self._steps,
-                "seconds_left": event["seconds_left"],
-                "training_psnr": event["psnr"],
-                "event": encode_training_progress(event),
-            }
+            self._keeps_progress = False
+            self._set_progress(
+                {
+                    "stage": self._stage,
+                    "step": event["iteration"],
+                    "total_steps": self._steps,
+                    "seconds_left": event["seconds_left"],
+                    "training_psnr": event["psnr"],
+                    "event": encode_training_progress(event),
+                }
+            )
         elif kind == "checkpoint_written":
             self._want_checkpoint(event["iteration"])
         elif kind == "stage_finished":
             # The last step comes before the end in the event log too, and is not lost to the next first one.
             if self._progress is not None and "event" in self._progress:
                 self._events.append(("progress", self._progress.pop("event")))
+            self._keeps_progress = self._keeps_progress and event["stage"] != "train"
             if event["stage"] in ("poses", "placing", "lenses", "train"):
                 self._want_checkpoint(self._steps if event["stage"] == "train" else 0)
         elif kind == BlocksPlanned.kind:
@@ -176,17 +186,23 @@ class Reporter:
         """Stop without writing what is pending."""
         await cancel_and_wait(self._tasks)
 
+    def _set_progress(self, progress: dict[str, Any]) -> None:
+        if not self._keeps_progress:
+            self._progress = progress
+
     def _on_stage_progress(self, event: dict[str, Any]) -> None:
         step, total = int(event["step"]), int(event["total_steps"])
-        self._progress = {
-            "stage": event["stage"],
-            "step": step,
-            "total_steps": total,
-            "seconds_left": self._time_left.seconds_left(
-                *work_of_stage(step, total, float(event.get("part", 0.0)), event.get("work_done"))
-            ),
-            "event": {key: value for key, value in event.items() if key != "kind"},
-        }
+        self._set_progress(
+            {
+                "stage": event["stage"],
+                "step": step,
+                "total_steps": total,
+                "seconds_left": self._time_left.seconds_left(
+                    *work_of_stage(step, total, float(event.get("part", 0.0)), event.get("work_done"))
+                ),
+                "event": {key: value for key, value in event.items() if key != "kind"},
+            }
+        )
 
     def _want_checkpoint(self, step: int) -> None:
         self._wanted_checkpoint = (self._stage, step)

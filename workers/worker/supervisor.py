@@ -229,7 +229,7 @@ class Supervisor:
             await asyncio.to_thread(self._workspace.discard_run)
             await self._tell_begun_anew(f"the checkpoint cannot be used, so the job begins anew: {error}")
             return False
-        self._reporter.record_resume(checkpoint)
+        self._reporter.record_resume(checkpoint, keeps_progress=self._job.attempt in self._job.continuations)
         data = {"stage": checkpoint.stage, "step": checkpoint.step, "attempt": checkpoint.attempt}
         await self._attempt.add_event("resumed", data)
         return True
