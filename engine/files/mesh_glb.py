@@ -155,9 +155,11 @@ def _read_triangles(file: GlbFile, *, with_materials: bool) -> tuple[ImportedMes
         for key in (Q_KEY, MIN_OPACITY_KEY, ALPHA_CUTOFF_KEY)
         if isinstance(value := stated.get(key), int | float)
     }
+    joined_triangles = np.concatenate([*triangles, np.zeros((0, 3), np.int64)])
+    normals = joined.get("normal")
     mesh = ImportedMesh(
         np.concatenate([*vertices, np.zeros((0, 3))]),
-        np.concatenate([*triangles, np.zeros((0, 3), np.int64)]),
+        joined_triangles,
         uv=joined["uv"],
         gid=_flatten_scalar(joined["gid"]),
         corner=_flatten_scalar(joined["corner"]),
@@ -167,7 +169,7 @@ def _read_triangles(file: GlbFile, *, with_materials: bool) -> tuple[ImportedMes
         scene_size=scene_size_of(stated.get(SCENE_SIZE_KEY)),
         alpha_cutoff=numbers_stated.get(ALPHA_CUTOFF_KEY),
         part=glb_parts.stated_part(file.document),
-        normals=joined.get("normal"),
+        corner_normals=None if normals is None else normals[joined_triangles],
         rgb_linear=joined.get("color"),
         alpha=_flatten_scalar(joined.get("alpha")),
     )

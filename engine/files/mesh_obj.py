@@ -15,8 +15,19 @@ from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.core.writing import atomic_replace, write_text
 from octasplat.engine.files.export_options import ExportOptions
-from octasplat.engine.files.obj_materials import UNKNOWN_RGB_LINEAR, missing_libraries, read_mtl
-from octasplat.engine.files.obj_parser import ObjParts, parse_block, read_blocks, uv_of_vertices
+from octasplat.engine.files.obj_materials import (
+    UNKNOWN_RGB_LINEAR,
+    library_names,
+    missing_libraries,
+    read_mtl,
+)
+from octasplat.engine.files.obj_parser import (
+    ObjParts,
+    corner_values,
+    parse_block,
+    read_blocks,
+    uv_of_vertices,
+)
 from octasplat.engine.files.octagon_batches import BATCH_SIZE, OctagonBatch, OctagonSoup
 from octasplat.engine.files.place_comments import place_comments
 from octasplat.engine.files.registry import Exporter, MeshReader, SurfaceWriter, register
@@ -53,7 +64,7 @@ def read(path: Path) -> ImportedMesh:
 
 
 def read_with_materials(path: Path) -> ImportedMesh:
-    """Read the triangles of an OBJ with texture coordinates of every corner, vertex colors and materials.
+    """Read the triangles of an OBJ with texture coordinates and normals of corners, colors and materials.
 
     Raises:
         SceneFileError: likewise, or an image that its MTL names is missing.
@@ -76,6 +87,7 @@ def _read(path: Path, parts: ObjParts) -> ImportedMesh:
     materials = _read_materials(path, parts, len(positions)) if parts.with_materials else {}
     parts.uv.clear()
     parts.triangle_uv.clear()
+    parts.triangle_normals.clear()
     triangles = np.concatenate([*parts.triangles, np.zeros((0, 3), np.int32)], dtype=np.int64)
     rounding = 0.5 * 10.0**-parts.decimals  # half a unit of the last digit
     return ImportedMesh(
@@ -91,23 +103,24 @@ def _read(path: Path, parts: ObjParts) -> ImportedMesh:
 
 
 def _read_materials(path: Path, parts: ObjParts, count: int) -> dict[str, Any]:
-    """Return texture coordinates of corners, colors of vertices and materials."""
-    places = np.concatenate([*parts.triangle_uv, np.zeros((0, 3), np.int32)])
-    looks: dict[str, Any] = {}
-    if parts.uv and (places >= 0).any():
-        table = np.concatenate([flip_v(np.concatenate(parts.uv)), np.full((1, 2), np.nan, np.float32)])
-        looks["corner_uv"] = table[places]  # -1 is the last row
+    """Return texture coordinates and normals of corners, colors of vertices and materials."""
+    uv = [flip_v(values) for values in parts.uv]
+    looks: dict[str, Any] = {
+        "corner_uv": corner_values(path, uv, parts.triangle_uv, "texture coordinate"),
+        "corner_normals": corner_values(path, parts.normals, parts.triangle_normals, "normal"),
+    }
     # Only where every vertex has a color, as they are told apart by their order
     if sum(map(len, parts.colors)) == count:
         looks["rgb_linear"] = srgb_to_linear(np.clip(np.concatenate(parts.colors), 0, 1)).astype(np.float32)
     if parts.material_uses:
         known = {name: k for k, name in enumerate(dict.fromkeys(name for _, name in parts.material_uses))}
-        materials = read_mtl(path, parts.libraries)
-        numbers = np.full(len(places), -1, np.int32)
+        libraries = library_names(path, parts.libraries)
+        materials = read_mtl(path, libraries)
+        numbers = np.full(parts.triangle_count, -1, np.int32)
         # Each use holds until the next one.
         for start, name in parts.material_uses:
             numbers[start:] = known[name]
-        lost = missing_libraries(path, parts.libraries)
+        lost = missing_libraries(path, libraries)
         why = f"{', '.join(lost)} is not in the folder of the OBJ" if lost else "no MTL file has one"
         # Colors of vertices are multiplied by that of the material.
         grey = (1.0, 1.0, 1.0) if "rgb_linear" in looks else UNKNOWN_RGB_LINEAR

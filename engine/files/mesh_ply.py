@@ -101,6 +101,8 @@ def read_with_materials(path: Path) -> ImportedMesh:
         SceneFileError: likewise.
     """
     mesh = read(path)
+    if mesh.triangles.max(initial=-1) >= len(mesh):
+        return mesh  # damaged, which is told for all formats alike
     table = read_ply(path, ["vertex"])[1]["vertex"]
     names = set(table.dtype.names or ())
     uv = mesh.uv
@@ -115,7 +117,7 @@ def read_with_materials(path: Path) -> ImportedMesh:
     return replace(
         mesh,
         corner_uv=None if uv is None else flip_v(uv)[mesh.triangles],
-        normals=columns(table, _NORMAL) if set(_NORMAL) <= names else None,
+        corner_normals=columns(table, _NORMAL)[mesh.triangles] if set(_NORMAL) <= names else None,
         rgb_linear=colors,
     )
 

@@ -5,6 +5,7 @@ The keys of http://paulbourke.net/dataformats/mtl/ with the extension for physic
 """
 
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,8 @@ from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.geometry.mesh_material import MeshMaterial, resolve_image
 
 MAX_BYTES = 64 << 20
+_LIBRARY_NAMES = re.compile(r"\S.*?\.mtl(?=\s|$)|\S+", re.IGNORECASE)
+"""Names in a row: each up to its suffix, with the spaces in it, or a word without one."""
 UNKNOWN_RGB_LINEAR = (0.6, 0.6, 0.6)
 """Of a material that states no color, or of which nothing is known."""
 NUMBERS = {"Ns", "Ni", "d", "Tr", "Pr", "Pm", "Pc", "Pcr", "illum"}
@@ -29,6 +32,8 @@ IMAGE_OPTIONS = {
 """Options of images, with the values that ask for nothing; a third number of a place is its depth."""
 IGNORED_OPTIONS = {"-blendu", "-blendv", "-boost", "-texres"}
 """Options of how an image is made smaller, which is not done here."""
+EXTENSION_KEYS = {"Pr", "Pm", "Ps", "Pc", "Pcr", "aniso", "anisor"}
+"""Keys that programs write with the extension, and not without it."""
 GLASS_ILLUM_MODELS = (4, 6, 7, 9)
 """Illumination models with refraction or with transparency by ray tracing."""
 
@@ -40,7 +45,8 @@ def read_mtl(obj: Path, names: Sequence[str]) -> dict[str, MeshMaterial]:
         SceneFileError: a file cannot be read, a number is none, or an image is missing.
     """
     materials: dict[str, MeshMaterial] = {}
-    for name in names:
+    # the first file that has a material counts
+    for name in reversed(names):
         path = _library_path(obj, name)
         if path is None:
             continue
@@ -53,6 +59,15 @@ def read_mtl(obj: Path, names: Sequence[str]) -> dict[str, MeshMaterial]:
         for entry in _parse_entries(text):
             materials[entry["newmtl"]] = _parse_material(path, entry)
     return materials
+
+
+def library_names(obj: Path, lines: Sequence[str]) -> tuple[str, ...]:
+    """Return the MTL files that lines ``mtllib`` of an OBJ name, one or several a line."""
+    names: list[str] = []
+    for line in lines:
+        several = _LIBRARY_NAMES.findall(line)
+        names += [line] if _library_path(obj, line) is not None else several
+    return tuple(names)
 
 
 def missing_libraries(obj: Path, names: Sequence[str]) -> tuple[str, ...]:
@@ -102,6 +117,11 @@ def _parse_material(path: Path, entry: dict[str, str]) -> MeshMaterial:
         colors["Ke"] = (1.0, 1.0, 1.0)
     opacity = numbers.get("d", 1.0 - numbers.get("Tr", 0.0))  # Tr is transparency
     clear = int(numbers.get("illum", 0)) in GLASS_ILLUM_MODELS and ("Ni" in numbers or opacity < 1.0)
+    # The light that glass lets through. With the extension Kd is its color, and Tf how much of it is glass.
+    if clear and "Tf" in entry and not EXTENSION_KEYS & set(entry):
+        red, green, blue = _parse_numbers(path, "Tf", entry["Tf"], 3)
+        if red or green or blue:
+            colors["Kd"] = (red, green, blue)
     known = NUMBERS | COLORS | set(IMAGES) | IGNORED_KEYS
     passed_over += [key for key in entry if key not in known]
     return MeshMaterial(

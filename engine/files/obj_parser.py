@@ -3,7 +3,7 @@
 import codecs
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
@@ -27,12 +27,15 @@ class ObjParts:
 
     positions: list[np.ndarray] = field(default_factory=list)
     uv: list[np.ndarray] = field(default_factory=list)
+    normals: list[np.ndarray] = field(default_factory=list)
     triangles: list[np.ndarray] = field(default_factory=list)
     triangle_uv: list[np.ndarray] = field(default_factory=list)
+    triangle_normals: list[np.ndarray] = field(default_factory=list)
     comments: list[str] = field(default_factory=list)
     decimals: int = 0
     vertex_count: int = 0
     uv_count: int = 0
+    normal_count: int = 0
     triangle_count: int = 0
     with_materials: bool = False
     colors: list[np.ndarray] = field(default_factory=list)
@@ -75,12 +78,19 @@ def parse_block(path: Path, block: bytes, parts: ObjParts) -> None:
     third = data[np.minimum(starts + 2, len(data) - 1)]
     blank = (second == SPACE) | (second == TAB)
     is_position = (first == ord("v")) & blank
-    is_uv = (first == ord("v")) & (second == ord("t")) & ((third == SPACE) | (third == TAB))
+    is_spaced = (third == SPACE) | (third == TAB)
+    is_uv = (first == ord("v")) & (second == ord("t")) & is_spaced
+    is_normal = (first == ord("v")) & (second == ord("n")) & is_spaced
     is_face = (first == ord("f")) & blank
     lengths = ends - starts
-    # Vertices and texture coordinates before each line, from which its relative numbers count back.
+    # What comes before each line, from which its relative numbers count back.
     before = np.stack(
-        [parts.vertex_count + np.cumsum(is_position), parts.uv_count + np.cumsum(is_uv)], axis=1
+        [
+            parts.vertex_count + np.cumsum(is_position),
+            parts.uv_count + np.cumsum(is_uv),
+            parts.normal_count + np.cumsum(is_normal),
+        ],
+        axis=1,
     )
     if is_position.any():
         text = _select_lines(data, is_position, lengths)
@@ -100,6 +110,11 @@ def parse_block(path: Path, block: bytes, parts: ObjParts) -> None:
         text = _select_lines(data, is_uv, lengths).translate(None, b"vt")
         parts.uv.append(_parse_number_rows(path, text, int(is_uv.sum()), "vt")[:, :2].astype(np.float32))
         parts.uv_count += int(is_uv.sum())
+    if is_normal.any():
+        if parts.with_materials:
+            text = _select_lines(data, is_normal, lengths).replace(b"vn", b"")
+            parts.normals.append(_parse_normals(path, text, int(is_normal.sum())))
+        parts.normal_count += int(is_normal.sum())
     spans = [(0, len(starts), "")]
     if parts.with_materials:
         _parse_libraries(block, parts)
@@ -151,6 +166,15 @@ def _parse_number_rows(path: Path, text: bytes, lines: int, keyword: str) -> np.
     return values.reshape(lines, words)
 
 
+def _parse_normals(path: Path, text: bytes, lines: int) -> Float32[np.ndarray, "n 3"]:
+    """Parse normals; what is no direction, as some programs write it, is not-a-number."""
+    try:
+        values = _parse_number_rows(path, text, lines, "vn")[:, :3].astype(np.float32)
+    except (SceneFileError, ValueError):
+        values = np.zeros((lines, 0), np.float32)
+    return values if values.shape == (lines, 3) else np.full((lines, 3), np.nan, np.float32)
+
+
 def _ragged_numbers(path: Path, text: bytes, keyword: str) -> np.ndarray:
     """Parse as many columns as the shortest line has (some programs color only part of the vertices)."""
     rows = [line.split() for line in text.split(b"\n") if line.strip()]
@@ -160,21 +184,22 @@ def _ragged_numbers(path: Path, text: bytes, keyword: str) -> np.ndarray:
     return np.array([[float(word) for word in row[:width]] for row in rows])
 
 
-def _parse_faces(path: Path, text: bytes, before: Int64[np.ndarray, "f 2"], parts: ObjParts) -> None:
-    """Parse faces as triangle fans, with the texture coordinates of their corners where given.
+def _parse_faces(path: Path, text: bytes, before: Int64[np.ndarray, "f 3"], parts: ObjParts) -> None:
+    """Parse faces as triangle fans, with texture coordinates and normals of their corners where given.
 
     Args:
         path: named in errors.
         text: the lines of the faces.
-        before: vertices and texture coordinates that come before each of these lines.
+        before: vertices, texture coordinates and normals that come before each of these lines.
         parts: gets the triangles.
     """
     lines = len(before)
+    text = text.replace(b"//", b"/0/")  # 0 stands for none
     sample = text[: text.index(b"\n")].split()[1:]
     slashes = {word.count(b"/") for word in sample}
     spaces, words_per_line = text.count(b"/"), len(sample)
     uniform = len(slashes) == 1 and spaces == lines * words_per_line * next(iter(slashes))
-    if uniform and b"//" not in text:
+    if uniform:
         per_word = 1 + next(iter(slashes))
         values = _parse_number_rows(path, text.replace(b"/", b" ").translate(None, b"f"), lines, "f")
         if (
@@ -183,19 +208,18 @@ def _parse_faces(path: Path, text: bytes, before: Int64[np.ndarray, "f 2"], part
             and not _is_ragged(text, words_per_line + 1)
         ):
             indices = values.astype(np.int64).reshape(lines, words_per_line, per_word)
-            _add_fans(indices[:, :, 0], indices[:, :, 1] if per_word > 1 else None, before, parts)
+            _add_fans(indices[:, :, :3], before, parts)
             return
     for number, line in enumerate(text.split(b"\n")[:lines]):
         words = [word.split(b"/") for word in line.split()[1:]]
         if len(words) < 3:
             continue
         try:
-            vertex = np.array([[int(word[0]) for word in words]])
-            named = all(len(word) > 1 and word[1] for word in words)
-            texture = np.array([[int(word[1]) for word in words]]) if named else None
+            width = min(max(map(len, words)), 3)
+            indices = np.array([[int(part or 0) for part in [*word, b"", b""][:width]] for word in words])
         except ValueError as error:
             raise SceneFileError(f"{path}: a line 'f' holds something that is no number.") from error
-        _add_fans(vertex, texture, before[number : number + 1], parts)
+        _add_fans(indices[None], before[number : number + 1], parts)
 
 
 def _is_ragged(text: bytes, words_per_line: int) -> bool:
@@ -209,20 +233,19 @@ def _is_ragged(text: bytes, words_per_line: int) -> bool:
     return bool((counts != words_per_line).any())
 
 
-def _add_fans(
-    vertex: np.ndarray, texture: np.ndarray | None, before: Int64[np.ndarray, "f 2"], parts: ObjParts
-) -> None:
-    sides = vertex.shape[1]
+def _add_fans(indices: Int64[np.ndarray, "f c w"], before: Int64[np.ndarray, "f 3"], parts: ObjParts) -> None:
+    """Add polygons of ``c`` corners, each with one to three indices: vertex, texture coordinates, normal."""
+    sides, width = indices.shape[1:]
     fan = np.array([[0, k, k + 1] for k in range(1, sides - 1)])
-    # Numbers count from 1; negative ones count back from the newest vertex before the line.
-    positions = np.where(vertex > 0, vertex - 1, vertex + before[:, :1])
-    parts.triangles.append(_to_int32(positions[:, fan].reshape(-1, 3)))
-    parts.triangle_count += len(parts.triangles[-1])
-    if texture is None:
-        parts.triangle_uv.append(np.full((len(vertex) * len(fan), 3), -1, np.int32))
-    else:
-        places = np.where(texture > 0, texture - 1, texture + before[:, 1:])
-        parts.triangle_uv.append(_to_int32(places[:, fan].reshape(-1, 3)))
+    # Numbers count from 1; negative ones count back from the newest before the line; 0 is none.
+    places = np.where(indices > 0, indices - 1, indices + np.where(indices < 0, before[:, None, :width], -1))
+    columns = [_to_int32(places[:, fan, column].reshape(-1, 3)) for column in range(width)]
+    none = np.full(columns[0].shape, -1, np.int32)
+    parts.triangles.append(columns[0])
+    parts.triangle_count += len(none)
+    parts.triangle_uv.append(columns[1] if width > 1 else none)
+    if parts.with_materials:
+        parts.triangle_normals.append(columns[2] if width > 2 else none)
 
 
 def _to_int32(numbers: Int64[np.ndarray, "t 3"]) -> Int32[np.ndarray, "t 3"]:
@@ -244,3 +267,26 @@ def uv_of_vertices(path: Path, parts: ObjParts, count: int) -> Float32[np.ndarra
             raise SceneFileError(f"{path}: a face names a vertex that is not there; the file is damaged.")
         uv[vertices] = table[places]
     return uv
+
+
+def corner_values(
+    path: Path, values: Sequence[np.ndarray], places: Sequence[np.ndarray], name: str
+) -> Float32[np.ndarray, "t 3 w"] | None:
+    """Return what all corners of triangles have, not-a-number where one has none; None where none has any.
+
+    Args:
+        path: named in errors.
+        values: rows of the file.
+        places: rows of the corners in these, -1 for none.
+        name: what a row is called.
+
+    Raises:
+        SceneFileError: a corner names a row that is not there.
+    """
+    rows = np.concatenate([*places, np.zeros((0, 3), np.int32)])
+    if not values or not (rows >= 0).any():
+        return None
+    table = np.concatenate([*values, np.full((1, values[0].shape[1]), np.nan, np.float32)])
+    if rows.max() >= len(table) - 1:
+        raise SceneFileError(f"{path}: a face names a {name} that is not there.")
+    return np.asarray(table[rows])  # -1 is the last row

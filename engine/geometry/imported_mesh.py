@@ -30,7 +30,7 @@ class ImportedMesh:
         rounding: how far a coordinate may be off because of the digits that the file keeps, beyond float32.
         corner_uv: of a mesh read with its looks: texture coordinates of the triangles' corners, (0, 0) at the
             upper left, NaN where there are none; None without any.
-        normals: likewise, of the vertices, NaN where there are none; None without any.
+        corner_normals: likewise, normals of the triangles' corners, of any length, NaN where there are none.
         rgb_linear: likewise, colors of the vertices.
         alpha: likewise, the alpha of these colors, NaN where a vertex has none.
         material_indices: likewise, row of each triangle in ``materials``, -1 for none.
@@ -50,7 +50,7 @@ class ImportedMesh:
     part: tuple[int, int] | None = None
     rounding: float = 0.0
     corner_uv: Float32[np.ndarray, "t 3 2"] | None = None
-    normals: Float32[np.ndarray, "v 3"] | None = None
+    corner_normals: Float32[np.ndarray, "t 3 3"] | None = None
     rgb_linear: Float32[np.ndarray, "v 3"] | None = None
     alpha: Float32[np.ndarray, " v"] | None = None
     material_indices: Int32[np.ndarray, " t"] | None = None

@@ -254,8 +254,8 @@ def _add_mesh(
     corners = transform_points(shape.vertices, mesh, turn)[shape.faces].astype(np.float32)
     degrees = SMOOTH_DEGREES if mesh.smooth_degrees is None else mesh.smooth_degrees
     normals = corner_normals(corners, degrees)
-    if mesh.smooth_degrees is None and shape.normals is not None:
-        stated = transform_normals(shape.normals, mesh, turn)[shape.faces]
+    if mesh.smooth_degrees is None and shape.corner_normals is not None:
+        stated = transform_normals(shape.corner_normals, mesh, turn)
         known = np.isfinite(stated).all(axis=(1, 2))
         normals[known] = stated[known]
     rows = np.empty(len(corners), np.int32)

@@ -34,7 +34,7 @@ class MeshShape:
         faces: three vertices each, anticlockwise from outside.
         corner_uv: texture coordinates of the faces' corners, (0, 0) at the upper left, NaN where there are
             none; None without any.
-        normals: of the vertices, NaN where they are not known; None without any.
+        corner_normals: of the faces' corners, NaN where they are not known; None without any.
         corner_rgb_linear: colors of the faces' corners; None without any.
         corner_alpha: alpha of these colors, NaN where there is none; None without any.
         material_numbers: row of each face in ``materials``, -1 for none; None without any.
@@ -44,7 +44,7 @@ class MeshShape:
     vertices: Float64[np.ndarray, "v 3"]
     faces: Int64[np.ndarray, "f 3"]
     corner_uv: Float32[np.ndarray, "f 3 2"] | None = None
-    normals: Float64[np.ndarray, "v 3"] | None = None
+    corner_normals: Float64[np.ndarray, "f 3 3"] | None = None
     corner_rgb_linear: Float32[np.ndarray, "f 3 3"] | None = None
     corner_alpha: Float32[np.ndarray, "f 3"] | None = None
     material_numbers: Int32[np.ndarray, " f"] | None = None
@@ -70,7 +70,7 @@ def read_shape(path: Path) -> MeshShape:
         vertices=mesh.vertices,
         faces=mesh.triangles,
         corner_uv=mesh.corner_uv,
-        normals=None if mesh.normals is None else mesh.normals.astype(np.float64),
+        corner_normals=None if mesh.corner_normals is None else mesh.corner_normals.astype(np.float64),
         corner_rgb_linear=None if mesh.rgb_linear is None else mesh.rgb_linear[mesh.triangles],
         corner_alpha=None if mesh.alpha is None else mesh.alpha[mesh.triangles],
         material_numbers=mesh.material_indices,
@@ -130,12 +130,12 @@ def transform_points(
 
 
 def transform_normals(
-    normals: Float64[np.ndarray, "n 3"], placement: Transformed, rotation: Float64[np.ndarray, "3 3"]
-) -> Float32[np.ndarray, "n 3"]:
+    normals: Float64[np.ndarray, "*n 3"], placement: Transformed, rotation: Float64[np.ndarray, "3 3"]
+) -> Float32[np.ndarray, "*n 3"]:
     """Return unit normals of points transformed by :func:`transform_points`; NaN for those of no length."""
     # normals scale by the inverse
     turned = normals / np.array(placement.scale) @ (rotation_matrix(placement.rotation_degrees) @ rotation).T
-    lengths = np.linalg.norm(turned, axis=1, keepdims=True)
+    lengths = np.linalg.norm(turned, axis=-1, keepdims=True)
     return np.asarray((turned / np.where(lengths > 1e-12, lengths, np.nan)).astype(np.float32))
 
 
@@ -202,21 +202,19 @@ def turn_outwards(shape: MeshShape, face_mask: Bool[np.ndarray, " f"]) -> MeshSh
         found[face_mask] = corners[face_mask][:, [0, 2, 1]]
         return found
 
-    normals = shape.normals
+    normals = turned(shape.corner_normals)
     if normals is not None:
         outwards = np.cross(c - a, b - a)
-        agreement = np.nansum(normals[faces] * outwards[:, None], axis=(1, 2)).sum()
-        if agreement < 0:  # normals may face outwards already, whatever the winding
-            normals = normals.copy()
-            own = np.unique(faces)
-            normals[own] = -normals[own]
+        # normals may face outwards already, whatever the winding
+        if np.nansum(normals[face_mask] * outwards[:, None]) < 0:
+            normals[face_mask] = -normals[face_mask]
     turned_faces = turned(shape.faces)
     assert turned_faces is not None
     return replace(
         shape,
         faces=turned_faces,
         corner_uv=turned(shape.corner_uv),
-        normals=normals,
+        corner_normals=normals,
         corner_rgb_linear=turned(shape.corner_rgb_linear),
         corner_alpha=turned(shape.corner_alpha),
     )
@@ -288,7 +286,7 @@ def _sphere_shape() -> MeshShape:
     u = np.where(np.nanmax(u, axis=1, keepdims=True) - u > 0.5, u + 1, u)  # faces across the seam
     u = np.where(np.isnan(u), np.nanmean(u, axis=1, keepdims=True), u)
     uv = np.stack([u, np.arccos(np.clip(corners[..., 1], -1, 1)) / np.pi], axis=-1)
-    return MeshShape(vertices, faces.astype(np.int64), uv.astype(np.float32), vertices)
+    return MeshShape(vertices, faces.astype(np.int64), uv.astype(np.float32), corners)
 
 
 def _cube_shape() -> MeshShape:

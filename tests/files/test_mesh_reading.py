@@ -122,11 +122,12 @@ def test_obj_rounding_follows_the_digits(tmp_path: Path) -> None:
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 -9\n", "names a vertex that is not there"),
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf a b c\n", "'f' holds something that is no number"),
         ("v 0 0 nan\n", "not finite"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 0 0 1\nf 1//1 2//1 3//2\n", "a normal that is not there"),
     ],
 )
 def test_obj_damaged_is_refused(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(SceneFileError, match=r"mesh\.obj.*" + message):
-        read_mesh(obj(tmp_path, text))
+        read_mesh(obj(tmp_path, text), with_materials=True)
 
 
 def triangle_document(**changes: Any) -> tuple[dict[str, Any], bytes]:
