@@ -24,7 +24,7 @@ from octasplat.engine.pathtracing.kernels.surface import GLASS
 from octasplat.engine.pathtracing.lights import (
     EmissiveMesh,
     build_light_arrays,
-    rectangle_sides,
+    light_triangles,
     triangle_areas,
 )
 from octasplat.engine.pathtracing.material_table import MaterialTable
@@ -40,7 +40,7 @@ from octasplat.engine.pathtracing.mesh_shapes import (
     up_axis_rotation,
 )
 from octasplat.engine.pathtracing.stage.materials import Diffuse, Emissive, Glass
-from octasplat.engine.pathtracing.stage.model import Light, PointLight, RectangleLight, Stage, StageMesh
+from octasplat.engine.pathtracing.stage.model import Stage, StageMesh
 from octasplat.engine.render.environment_files import read_environment
 from octasplat.engine.trace.triangle_bvh import TriangleBvh
 
@@ -133,7 +133,7 @@ def compile_meshes(
             warn=warn,
         )
     for number, light in enumerate(stage.lights):
-        corners = _light_triangles(light, up)
+        corners = light_triangles(light, up)
         if corners is not None:
             row = gathered.table.add_light(number)
             gathered.add(corners, corner_normals(corners, 0.0), np.full(len(corners), row, np.int32))
@@ -152,6 +152,7 @@ def compile_meshes(
         meshes=gathered.emissive,
         texels_linear=materials.texels_linear,
         texture_sizes=materials.texture_sizes,
+        found_by_paths=all(scene.shadows_on_meshes for scene in stage.gaussians),
     )
     points = surfaces.corners_world.reshape(-1, 3)
     faces = np.arange(len(points), dtype=np.int32).reshape(-1, 3)
@@ -381,24 +382,3 @@ def load_mesh_shape(
                 "alike), so that it cannot be glass; close it or choose another material."
             )
     return shape
-
-
-def _light_triangles(light: Light, up_world: Float64[np.ndarray, "3"]) -> Float32[np.ndarray, "f 3 3"] | None:
-    """Return the triangles of a visible light; None of an invisible one."""
-    if light.only_shadows:
-        return None
-    if isinstance(light, PointLight) and light.radius > 0.0 and light.visible:
-        ball = primitive_shape("sphere")
-        corners = ball.vertices[ball.faces] * light.radius + np.array(light.position)
-        return np.asarray(corners.astype(np.float32))
-    if not (isinstance(light, RectangleLight) and light.visible):
-        return None
-    u, v = rectangle_sides(light, up_world)
-    centre = np.array(light.position)
-    a, b, c, d = (
-        centre - u / 2 - v / 2,
-        centre + u / 2 - v / 2,
-        centre + u / 2 + v / 2,
-        centre - u / 2 + v / 2,
-    )
-    return np.array([[a, b, c], [a, c, d]], np.float32)

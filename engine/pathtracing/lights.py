@@ -24,6 +24,7 @@ from octasplat.engine.pathtracing.kernels.kernel_args import (
     SPOT,
     LightArrays,
 )
+from octasplat.engine.pathtracing.mesh_shapes import primitive_shape
 from octasplat.engine.pathtracing.stage.model import (
     DirectionalLight,
     Light,
@@ -110,6 +111,8 @@ def build_light_arrays(
     meshes: Sequence[EmissiveMesh] = (),
     texels_linear: Float32[np.ndarray, "x 3"] | None = None,
     texture_sizes: Int64[np.ndarray, "k 3"] | None = None,
+    *,
+    found_by_paths: bool = True,
 ) -> LightArrays:
     """Return arrays of the lights, emissive meshes and the environment, in this order.
 
@@ -120,6 +123,8 @@ def build_light_arrays(
         meshes: that shine.
         texels_linear: of the textures of the meshes' light.
         texture_sizes: likewise.
+        found_by_paths: whether scattered paths that meet a light count beside the light queries of surfaces:
+            not where Gaussians keep off the one that keep nothing off the other.
     """
     tables = _mesh_tables(meshes)
     count = len(lights) + len(meshes) + (environment is not None)
@@ -161,13 +166,13 @@ def build_light_arrays(
         positions[l] = own @ mesh.corners_world.mean(axis=1, dtype=np.float64) / own.sum()
         textures[l], rows[l] = mesh.texture, tables.rows[l - len(lights)]
         opacities[l], opacity_textures[l], opacity_cutoffs[l], uses_vertex_alpha[l] = mesh.opacity
-    # light from where nothing keeps it off is not found by paths that things keep off
-    visibility *= casts_shadows
     takes = casts_shadows * (1 - adds)
     radiance, frame = np.zeros((1, 1, 3), np.float32), np.eye(3)  # the kernels need a map: one black pixel
     if environment is not None:
         radiance, frame = environment.radiance_linear, environment.frame
         kinds[-1], rgb[-1], visibility[-1] = ENVIRONMENT, mean_irradiance(radiance), 1
+    # light from where nothing keeps it off is not found by paths that things keep off
+    visibility *= casts_shadows * found_by_paths
     sampler = build_environment_sampler(radiance)
     return LightArrays(
         kinds=kinds,
@@ -222,6 +227,27 @@ def rectangle_sides(
         level = np.cross(np.eye(3)[np.argmin(np.abs(facing))], facing)
     level /= np.linalg.norm(level)
     return level * light.width, np.cross(facing, level) * light.height
+
+
+def light_triangles(light: Light, up_world: Float64[np.ndarray, "3"]) -> Float32[np.ndarray, "f 3 3"] | None:
+    """Return the triangles of a visible light; None of an invisible one."""
+    if light.only_shadows:
+        return None
+    if isinstance(light, PointLight) and light.radius > 0.0 and light.visible:
+        ball = primitive_shape("sphere")
+        corners = ball.vertices[ball.faces] * light.radius + np.array(light.position)
+        return np.asarray(corners.astype(np.float32))
+    if not (isinstance(light, RectangleLight) and light.visible):
+        return None
+    u, v = rectangle_sides(light, up_world)
+    centre = np.array(light.position)
+    a, b, c, d = (
+        centre - u / 2 - v / 2,
+        centre + u / 2 - v / 2,
+        centre + u / 2 + v / 2,
+        centre - u / 2 + v / 2,
+    )
+    return np.array([[a, b, c], [a, c, d]], np.float32)
 
 
 def eval_environment_map(

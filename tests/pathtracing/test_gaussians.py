@@ -26,7 +26,7 @@ from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.render.renderer import render_rays
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import TraceSettings
-from tests.support.light_scenes import camera, psnr, table_with_a_box
+from tests.support.light_scenes import camera, film_of, psnr, table_with_a_box
 
 PLAIN = Integrator(samples=1, max_depth=6, roulette_depth=64, anti_aliasing=False)
 
@@ -190,6 +190,33 @@ def test_gaussian_wall_shadow_equals_mesh_shadow(light: str) -> None:
     assert (np.abs(empty - by_mesh).max(axis=2) > 0.2).mean() > 0.05
     # The Gaussians end softly; only where the mesh's edge falls the two may differ.
     assert (np.abs(by_mesh - by_gaussians).max(axis=2) > 0.1).mean() < 0.03
+
+
+@pytest.mark.parametrize("lamp", ["rectangle", "environment"])
+def test_gaussians_without_shadows_on_meshes_keep_no_light_off_them(lamp: str, tmp_path: Path) -> None:
+    write_exr(tmp_path / "even.exr", {channel: np.full((4, 8), 0.5, np.float32) for channel in "RGB"})
+    rectangle = RectangleLight(position=(0, 0, -1), direction=(0, 0, 1), width=4, height=4, radiance=0.5)
+    lights: dict[str, object] = {"lights": (rectangle,)}
+    if lamp == "environment":
+        lights = {"environment": Environment(file="even.exr")}
+    screen = StageMesh(
+        shape="cube", scale=(9, 9, 1), position=(0, 0, 2), material=Diffuse(color_srgb=(1, 1, 1))
+    )
+    numbers = Integrator(samples=64, max_depth=2, anti_aliasing=False)
+    view = camera((-2, 0, 0.5), (0, 0, 1), (5, 5), 1)
+
+    def lit(**more: bool) -> float:
+        """Light on the screen behind a black wall of Gaussians that is as large as it."""
+        stage = Stage(
+            gaussians=(StageGaussians(light="emissive", **more),), meshes=(screen,), integrator=numbers,
+            **lights,
+        )  # fmt: skip
+        return float(srgb_to_linear(picture(stage, view, wall(0.0, 9.0, color=0.0), tmp_path)).mean())
+
+    alone = Stage(gaussians=(), meshes=(screen,), integrator=numbers, **lights)
+    free = film_of(alone, view, tmp_path).image().rgb_linear.mean()
+    assert free > 0.2 and lit() < 0.02
+    assert lit(shadows_on_meshes=False) == pytest.approx(free, rel=0.02)
 
 
 def picture_without(stage: Stage, view: PinholeCamera) -> np.ndarray:

@@ -27,6 +27,7 @@ BESIDE = camera((2.0, 0, -0.8), (-0.3, 0, 0), (41, 5), 12)
 BLACK = (0.0, 0.0, 0.0)
 FLOOR = StageMesh(shape="plane", position=(0, 1, 0), scale=9, material=Diffuse(color_srgb=(1, 1, 1)))
 LID = StageMesh(shape="plane", position=(0, -1, 0), scale=9, material=Diffuse(color_srgb=BLACK))
+PANE = StageMesh(shape="cube", scale=(3, 0.1, 3), position=(0, -1, 0), material=Glass(ior=1.5))
 BELOW = camera((-3, 0.5, 0), (0, 1, 0), (3, 3), 1e-3)
 
 
@@ -106,12 +107,20 @@ def test_visible_lamp_without_shadows_lights_as_if_nothing_were_in_its_way() -> 
             assert found == pytest.approx(expected, rel=5e-3)
 
 
+def test_light_of_a_lamp_without_shadows_comes_through_glass_once() -> None:
+    lamp = RectangleLight(
+        position=(0, -3, 0), direction=(0, 1, 0), width=2, height=2, radiance=10, casts_shadows=False
+    )
+    alone = floor_radiance(lamp, depth=6, samples=1024)
+    # the pane sends a little of what the floor reflects back to it, some 7 %
+    assert alone < floor_radiance(lamp, PANE, depth=6, samples=1024) < 1.1 * alone
+
+
 def test_lamp_that_does_not_light_meshes_is_seen_and_lights_gaussians() -> None:
     lamp = RectangleLight(
         position=(0, -3, 0), direction=(0, 1, 0), width=2, height=2, radiance=10, lights_meshes=False
     )
-    pane = StageMesh(shape="cube", scale=(3, 0.1, 3), position=(0, -1, 0), material=Glass(ior=1.5))
-    for meshes in ((), (pane,)):
+    for meshes in ((), (PANE,)):
         assert floor_radiance(lamp, *meshes, depth=6, samples=64) == 0.0
     below = camera((0, 0.5, 1e-3), (0, -3, 0), (3, 3), 1)
     stage = Stage(gaussians=(), meshes=(FLOOR,), lights=(lamp,), integrator=DIRECT)

@@ -25,6 +25,7 @@ from octasplat.engine.pathtracing.kernels.scatter import (
     FLAG_CAMERA_RAY,
     FLAG_CLEAR,
     FLAG_SCATTERED,
+    FLAG_THROUGH_GLASS,
     LOBE_SAMPLE,
     draw_light,
     queue_shadow_ray,
@@ -94,7 +95,7 @@ def scatter_mirror(paths: PathArrays, p: int, point: SurfacePoint, reflectance: 
     # an interpolated normal may send it into the surface: the face's own then
     if r_x * n_x + r_y * n_y + r_z * n_z <= 0.0:
         r_x, r_y, r_z = reflect(d[0], d[1], d[2], n_x, n_y, n_z)
-    paths.flags[p] &= ~FLAG_CAMERA_RAY
+    paths.flags[p] &= ~(FLAG_CAMERA_RAY | FLAG_THROUGH_GLASS)
     paths.throughput[p, 0] *= red
     paths.throughput[p, 1] *= green
     paths.throughput[p, 2] *= blue
@@ -134,6 +135,8 @@ def scatter_smooth_glass(
         paths.flags[p] &= ~FLAG_CAMERA_RAY
         along = cosine / eta - cos_t
         t_x, t_y, t_z = normalize(t_x / eta + along * s_x, t_y / eta + along * s_y, t_z / eta + along * s_z)
+    if paths.pdf[p] > 0.0:
+        paths.flags[p] |= FLAG_THROUGH_GLASS
     _enter_far_side(paths, p, glass)
     x, y, z = offset_ray_origin(x, y, z, -n_x, -n_y, -n_z)
     spawn_ray(paths, p, x, y, z, t_x, t_y, t_z, 0.0)
@@ -222,7 +225,7 @@ def scatter_rough_glass(
     through = i_z < 0.0
     for channel in range(3):
         paths.throughput[p, channel] *= gain * value / pdf * (tint[channel] if through else 1.0)
-    paths.flags[p] = (paths.flags[p] | FLAG_SCATTERED) & ~(FLAG_CLEAR | FLAG_CAMERA_RAY)
+    paths.flags[p] = (paths.flags[p] | FLAG_SCATTERED) & ~(FLAG_CLEAR | FLAG_CAMERA_RAY | FLAG_THROUGH_GLASS)
     w_x, w_y, w_z = normalize(w_x, w_y, w_z)
     if through:
         _enter_far_side(paths, p, glass)

@@ -12,7 +12,11 @@ from octasplat.engine.pathtracing.kernels.lights import (
     light_probability,
 )
 from octasplat.engine.pathtracing.kernels.path_args import PathArrays, PathScratch
-from octasplat.engine.pathtracing.kernels.scatter import FLAG_CAMERA_RAY, FLAG_SCATTERED
+from octasplat.engine.pathtracing.kernels.scatter import (
+    FLAG_CAMERA_RAY,
+    FLAG_SCATTERED,
+    FLAG_THROUGH_GLASS,
+)
 from octasplat.engine.trace.kernels.native import njit_no_refcount
 
 
@@ -55,6 +59,8 @@ def shade_miss(
     red, green, blue = eval_background(lights, environment, integrator, paths.flags[p], d[0], d[1], d[2])
     share = 1.0
     if environment >= 0 and paths.pdf[p] > 0.0:
+        if not lights.is_hittable[environment]:
+            return
         # the environment could also have been found by a light query: the balance heuristic's share
         o = paths.origins_world[p]
         pdf = light_probability(lights, environment, o[0], o[1], o[2]) * environment_pdf(
@@ -87,6 +93,9 @@ def shade_emitter(
     if paths.flags[p] & FLAG_SCATTERED and not lights.lights_meshes[l]:
         return
     if paths.pdf[p] > 0.0 and not lights.is_hittable[l]:
+        return
+    # glass was no obstacle to the light query
+    if paths.flags[p] & FLAG_THROUGH_GLASS and not lights.casts_shadows[l]:
         return
     share = 1.0
     if paths.pdf[p] > 0.0:  # the camera, mirrors and glass find lights in no other way

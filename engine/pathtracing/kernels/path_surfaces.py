@@ -44,6 +44,7 @@ from octasplat.engine.pathtracing.kernels.rough_dielectric import MIN_GLASS_ROUG
 from octasplat.engine.pathtracing.kernels.sampler import fill_pair
 from octasplat.engine.pathtracing.kernels.scatter import (
     FLAG_CAMERA_RAY,
+    FLAG_THROUGH_GLASS,
     LIGHT_CHOICE_SAMPLE,
     LOBE_SAMPLE,
     sample_pair,
@@ -303,6 +304,8 @@ def shade_surfaces(first: int, last: int, scratch: PathScratch, bounce: Bounce) 
             p = active[k]
             # what lies behind a passed surface of glass is found by this path alone: it shadows light queries
             if scene.any_nested and copy_media(hits.media[k], paths.media[p]):
+                if paths.pdf[p] > 0.0:
+                    paths.flags[p] |= FLAG_THROUGH_GLASS
                 paths.pdf[p] = 0.0
             if face < 0:
                 shade_miss(paths, p, lights, scene.environment, integrator)

@@ -42,6 +42,8 @@ FLAG_CAMERA_RAY = 4
 """Mark: the path is still the camera's own ray."""
 FLAG_GAUSSIAN_SURFACE = 8
 """Mark: what the camera sees in this place is a surface of Gaussians with materials."""
+FLAG_THROUGH_GLASS = 16
+"""Mark: since it scattered, the path has gone through glass, and was reflected nowhere."""
 
 LOBE_SAMPLE, DIRECTION_SAMPLE, LIGHT_CHOICE_SAMPLE, LIGHT_POSITION_SAMPLE, LAYER_LIGHT_SAMPLE = 0, 1, 2, 3, 4
 """Pairs of uniform numbers of a surface."""
@@ -228,7 +230,7 @@ def scatter_path(
     paths.throughput[p, 0] *= f_r
     paths.throughput[p, 1] *= f_g
     paths.throughput[p, 2] *= f_b
-    paths.flags[p] = (paths.flags[p] | FLAG_SCATTERED) & ~(FLAG_CLEAR | FLAG_CAMERA_RAY)
+    paths.flags[p] = (paths.flags[p] | FLAG_SCATTERED) & ~(FLAG_CLEAR | FLAG_CAMERA_RAY | FLAG_THROUGH_GLASS)
     if not is_diffuse:
         w_x, w_y, w_z = normalize(w_x, w_y, w_z)
     spawn_ray(paths, p, x, y, z, w_x, w_y, w_z, pdf)
