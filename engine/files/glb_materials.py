@@ -108,10 +108,18 @@ class _MaterialReader:
             absorption=self._absorption_coefficients(),
             clear_coat=float(extensions.get("clearcoat", {}).get("clearcoatFactor", 0.0)),
             clear_coat_roughness=float(extensions.get("clearcoat", {}).get("clearcoatRoughnessFactor", 0.0)),
+            coat_has_normal_texture=self._coat_has_normal_texture(),
             **self._opacity(number, base[3], images.get("texture")),
             unsupported=self._unsupported_features(number),
             **images,  # type: ignore[arg-type]
         )
+
+    def _coat_has_normal_texture(self) -> bool:
+        """Return whether the normal texture of the clear coat is that of what is below."""
+        coat = self._extensions.get("clearcoat", {}).get("clearcoatNormalTexture")
+        usual = {"scale": 1.0, "texCoord": 0}
+        below = self._material.get("normalTexture", {})
+        return coat is not None and bool(usual | coat == usual | below)
 
     def _absorption_coefficients(self) -> tuple[float, float, float]:
         """Return the absorption of the volume, from its attenuation distance and color."""
@@ -187,6 +195,8 @@ class _MaterialReader:
             found.append("occlusionTexture")
         for values in self._extensions.values():
             found += sorted(PARTLY_SUPPORTED_EXTENSIONS & set(values))
+        if self._coat_has_normal_texture():
+            found.remove("clearcoatNormalTexture")
         infos = list(_texture_infos(material).values())
         if self._leaves_its_images(number, infos):
             found.append("images that are mirrored or end at their edges, as texture coordinates go beyond")

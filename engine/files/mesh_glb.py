@@ -20,9 +20,10 @@ import itertools
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Int, Int32, Int64
+from jaxtyping import Float32, Float64, Int, Int32, Int64
 
 from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.core.errors import ConfigError, SceneFileError
@@ -100,9 +101,31 @@ def _read(path: Path, *, with_materials: bool) -> ImportedMesh:
         if not with_materials:
             return mesh
         uv = None if mesh.uv is None else mesh.uv[mesh.triangles]
-        return replace(mesh, corner_uv=uv, material_indices=numbers, materials=glb_materials(file, path))
+        return replace(
+            mesh,
+            corner_uv=uv,
+            material_indices=numbers,
+            materials=glb_materials(file, path),
+            notes=_notes(file.document),
+        )
     except glb_container.GLB_READ_ERRORS as error:
         raise SceneFileError(f"{path}: its glTF is damaged or not understood ({error}).") from error
+
+
+def _notes(document: dict[str, Any]) -> tuple[str, ...]:
+    """Return sentences on what of the shape of a file is passed over."""
+    nodes = [node for node in document.get("nodes", []) if "mesh" in node]
+    weights = [part.get("weights", ()) for part in (*nodes, *document.get("meshes", []))]
+    found = {
+        "Its bones (skins) are passed over: its vertices stay where they lie.": any(
+            "skin" in node for node in nodes
+        ),
+        "Its morph targets are passed over: its vertices stay where they lie.": any(map(any, weights)),
+        "Copies of its meshes (EXT_mesh_gpu_instancing) are passed over: each is shown once.": any(
+            "EXT_mesh_gpu_instancing" in node.get("extensions", {}) for node in nodes
+        ),
+    }
+    return tuple(sentence for sentence, is_there in found.items() if is_there)
 
 
 def _read_triangles(file: GlbFile, *, with_materials: bool) -> tuple[ImportedMesh, Int32[np.ndarray, " t"]]:
@@ -139,7 +162,7 @@ def _read_triangles(file: GlbFile, *, with_materials: bool) -> tuple[ImportedMes
             if name in attributes:
                 values = file.array(attributes[name], np.float32)
                 if key == "normal":
-                    values = values @ np.linalg.inv(matrix[:3, :3])  # n' = M^-T n, in rows
+                    values = values @ _normal_map(matrix[:3, :3]).T
                 elif key == "uv" and with_materials:
                     values = values @ turn[:, :2].T + turn[:, 2]
                 elif key == "alpha":
@@ -174,6 +197,17 @@ def _read_triangles(file: GlbFile, *, with_materials: bool) -> tuple[ImportedMes
         alpha=_flatten_scalar(joined.get("alpha")),
     )
     return mesh, np.concatenate([*numbers, np.zeros(0, np.int32)])
+
+
+def _normal_map(linear: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3 3"]:
+    """Return the map of normals where points are mapped linearly: the inverse transposed, of another length.
+
+    Of cofactors, so that nodes of no extent, by which programs hide things, are no error.
+    """
+    a, b, c = linear
+    cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)])
+    largest = max(float(np.abs(cofactors).max()), 1e-300)
+    return np.asarray(cofactors / (-largest if np.linalg.det(linear) < 0 else largest))
 
 
 def _triangles_of(corners: Int64[np.ndarray, " c"], mode: int) -> Int64[np.ndarray, "t 3"]:

@@ -24,6 +24,7 @@ from octasplat.engine.files.obj_materials import (
 from octasplat.engine.files.obj_parser import (
     ObjParts,
     corner_values,
+    cut_concave_polygons,
     parse_block,
     read_blocks,
     uv_of_vertices,
@@ -83,6 +84,7 @@ def _read(path: Path, parts: ObjParts) -> ImportedMesh:
         raise SceneFileError(f"{path}: is no OBJ mesh; it has no line that begins with 'v'.")
     positions = np.concatenate(parts.positions)
     parts.positions.clear()  # or they are in memory twice
+    cut_concave_polygons(parts, positions)
     uv = uv_of_vertices(path, parts, len(positions))
     materials = _read_materials(path, parts, len(positions)) if parts.with_materials else {}
     parts.uv.clear()

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Int, Int64
+from jaxtyping import Float32, Float64, Int, Int64
 
 from octasplat.engine.core.color import srgb_to_linear, to_bytes
 from octasplat.engine.core.errors import SceneFileError
@@ -37,6 +37,7 @@ from octasplat.engine.geometry.imported_mesh import (
     number_in_comments,
     scene_size_of,
 )
+from octasplat.engine.geometry.polygons import fan_places, triangle_places
 from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 
 _POSITION, _NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
@@ -72,15 +73,16 @@ def read(path: Path) -> ImportedMesh:
         raise SceneFileError(f"{path}: is no mesh; its vertices lack the property {', '.join(missing)}.")
     table = tables["vertex"]
     face = header.element("face")
+    positions = np.empty((len(table), 3))
+    for axis, name in enumerate(_POSITION):
+        positions[:, axis] = table[name]
     triangles = np.zeros((0, 3), np.int64)
     if face is not None and face.count:
         name = next((prop.name for prop in face.lists if prop.name in _FACE_LISTS), None)
         if name is None:
             raise SceneFileError(f"{path}: its faces have no list 'vertex_indices'.")
-        triangles = _fan_triangles(np.asarray(read_ply(path, ["face"])[1]["face"][name]))
-    positions = np.empty((len(table), 3))
-    for axis, name in enumerate(_POSITION):
-        positions[:, axis] = table[name]
+        polygons = np.asarray(read_ply(path, ["face"])[1]["face"][name]).astype(np.int64)
+        triangles = _triangles_of(polygons, positions)
     return ImportedMesh(
         positions,
         triangles,
@@ -122,14 +124,18 @@ def read_with_materials(path: Path) -> ImportedMesh:
     )
 
 
-def _fan_triangles(polygons: np.ndarray) -> Int64[np.ndarray, "t 3"]:
+def _triangles_of(
+    polygons: Int64[np.ndarray, "p c"], positions: Float64[np.ndarray, "v 3"]
+) -> Int64[np.ndarray, "t 3"]:
     sides = polygons.shape[1]
-    if sides < 3:
-        return np.zeros((0, 3), np.int64)
     if sides == 3:
-        return polygons.astype(np.int64)
-    fan = np.array([[0, k, k + 1] for k in range(1, sides - 1)])
-    return polygons.astype(np.int64)[:, fan].reshape(-1, 3)
+        return polygons
+    fan = fan_places(sides)
+    # what names no vertex is refused by whoever reads the mesh
+    if sides < 4 or not (polygons.min() >= 0 and polygons.max() < len(positions)):
+        return polygons[:, fan].reshape(-1, 3)
+    places = triangle_places(positions[polygons]).reshape(len(polygons), -1)
+    return np.take_along_axis(polygons, places, axis=1).reshape(-1, 3)
 
 
 def _find_attribute(table: np.ndarray, name: str) -> Float32[np.ndarray, " v"] | None:

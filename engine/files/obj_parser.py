@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import IO
 
 import numpy as np
-from jaxtyping import Float32, Int32, Int64
+from jaxtyping import Float32, Float64, Int32, Int64
 
 from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.geometry.polygons import fan_places, triangle_places
 
 BLOCK_BYTES = 1 << 22
 NEWLINE, SPACE, TAB = 10, 32, 9  # every other white space lies below the space
@@ -41,6 +42,8 @@ class ObjParts:
     colors: list[np.ndarray] = field(default_factory=list)
     libraries: list[str] = field(default_factory=list)
     material_uses: list[tuple[int, str]] = field(default_factory=list)
+    polygons: dict[int, list[np.ndarray]] = field(default_factory=dict)
+    """First triangle of each polygon, by its number of corners."""
 
 
 def read_blocks(handle: IO[bytes]) -> Iterator[bytes]:
@@ -236,21 +239,51 @@ def _is_ragged(text: bytes, words_per_line: int) -> bool:
 def _add_fans(indices: Int64[np.ndarray, "f c w"], before: Int64[np.ndarray, "f 3"], parts: ObjParts) -> None:
     """Add polygons of ``c`` corners, each with one to three indices: vertex, texture coordinates, normal."""
     sides, width = indices.shape[1:]
-    fan = np.array([[0, k, k + 1] for k in range(1, sides - 1)])
+    fan = fan_places(sides)
     # Numbers count from 1; negative ones count back from the newest before the line; 0 is none.
     places = np.where(indices > 0, indices - 1, indices + np.where(indices < 0, before[:, None, :width], -1))
     columns = [_to_int32(places[:, fan, column].reshape(-1, 3)) for column in range(width)]
     none = np.full(columns[0].shape, -1, np.int32)
     parts.triangles.append(columns[0])
-    parts.triangle_count += len(none)
     parts.triangle_uv.append(columns[1] if width > 1 else none)
     if parts.with_materials:
+        if sides > 3:
+            first = parts.triangle_count + len(fan) * np.arange(len(indices))
+            parts.polygons.setdefault(sides, []).append(first)
         parts.triangle_normals.append(columns[2] if width > 2 else none)
+    parts.triangle_count += len(none)
 
 
 def _to_int32(numbers: Int64[np.ndarray, "t 3"]) -> Int32[np.ndarray, "t 3"]:
     """Convert to int32 with saturation, so that indices out of range stay out of range."""
     return np.clip(numbers, -1, np.iinfo(np.int32).max).astype(np.int32)
+
+
+def cut_concave_polygons(parts: ObjParts, positions: Float64[np.ndarray, "v 3"]) -> None:
+    """Cut polygons that are not convex, which are fans, into triangles that lie within them."""
+    columns = [parts.triangles, parts.triangle_uv, parts.triangle_normals]
+    if not parts.polygons:
+        return
+    rows = [np.concatenate(column) for column in columns]
+    for sides, starts in parts.polygons.items():
+        triangles = np.concatenate(starts)[:, None] + np.arange(sides - 2)
+        fans = rows[0][triangles]
+        if not (fans.min() >= 0 and fans.max() < len(positions)):
+            continue  # refused by whoever reads the mesh
+        fan = fan_places(sides)
+        places = triangle_places(positions[_corners_of_fans(fans)])
+        chosen = np.flatnonzero((places != fan).any(axis=(1, 2)))
+        for row in rows:
+            corners = _corners_of_fans(row[triangles[chosen]])
+            cut = np.take_along_axis(corners, places[chosen].reshape(-1, places[0].size), axis=1)
+            row[triangles[chosen]] = cut.reshape(-1, *fan.shape)
+    for column, row in zip(columns, rows, strict=True):
+        column[:] = [row]
+
+
+def _corners_of_fans(fans: Int32[np.ndarray, "p t 3"]) -> Int32[np.ndarray, "p c"]:
+    """Return the corners of polygons in their order."""
+    return np.concatenate([fans[:, 0, :2], fans[:, :, 2]], axis=1)
 
 
 def uv_of_vertices(path: Path, parts: ObjParts, count: int) -> Float32[np.ndarray, "v 2"] | None:

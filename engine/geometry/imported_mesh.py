@@ -16,7 +16,8 @@ class ImportedMesh:
     Attributes:
         vertices: positions as the file gives them, with the transforms of glTF nodes applied; which axes they
             are along is :mod:`octasplat.engine.edit.axes`' business.
-        triangles: vertex indices; polygons are cut into fans. Empty for a file of points.
+        triangles: vertex indices; polygons are cut into fans, or otherwise where they are not convex. Empty
+            for a file of points.
         uv: texture coordinates as the file has them (v may count up or down), or None; NaN where a vertex has
             none, and the last where it has several.
         gid: number of the Gaussian that a vertex belongs to, NaN where the file says none, or None.
@@ -35,6 +36,7 @@ class ImportedMesh:
         alpha: likewise, the alpha of these colors, NaN where a vertex has none.
         material_indices: likewise, row of each triangle in ``materials``, -1 for none.
         materials: likewise, those that the file gives.
+        notes: likewise, sentences on what of the file's shape is passed over.
     """
 
     vertices: Float64[np.ndarray, "v 3"]
@@ -55,6 +57,7 @@ class ImportedMesh:
     alpha: Float32[np.ndarray, " v"] | None = None
     material_indices: Int32[np.ndarray, " t"] | None = None
     materials: tuple[MeshMaterial, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.vertices)

@@ -49,6 +49,7 @@ class MeshMaterial:
         clear_coat_texture: multiplied by it, in red.
         clear_coat_roughness: perceptual.
         clear_coat_roughness_texture: multiplied by it, in green.
+        coat_has_normal_texture: whether the coat is said to follow ``normal_texture``, too.
         unsupported: what else the file says of it, which is not understood, in words.
     """
 
@@ -73,6 +74,7 @@ class MeshMaterial:
     clear_coat_texture: FileImage | None = None
     clear_coat_roughness: float = 0.0
     clear_coat_roughness_texture: FileImage | None = None
+    coat_has_normal_texture: bool = False
     unsupported: tuple[str, ...] = ()
 
 

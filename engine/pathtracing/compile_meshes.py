@@ -242,6 +242,8 @@ def _add_mesh(
     warn: WarnCallback,
 ) -> None:
     name = f"meshes[{number}]"
+    for note in shape.notes:
+        warn(f"{mesh.file}: {note}")
     materials = _face_materials(mesh, name, shape, warn)
     for chosen, given in materials:
         # only the winding tells which side of glass is inside

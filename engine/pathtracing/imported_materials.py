@@ -89,7 +89,11 @@ def import_material(
             left_out.append(f"transmission {source.transmission:g}, which is less than half")
         if source.normal_texture is not None and source.normal_scale < 0.0:
             left_out.append("the sign of the scale of its normal texture")
-        if source.clear_coat > 0.0 and source.normal_texture is not None:
+        if (
+            source.clear_coat > 0.0
+            and source.normal_texture is not None
+            and not source.coat_has_normal_texture
+        ):
             left_out.append("a clear coat that is smoother than the normal texture")
         fields = {
             "texture": source.texture,

@@ -39,6 +39,7 @@ class MeshShape:
         corner_alpha: alpha of these colors, NaN where there is none; None without any.
         material_numbers: row of each face in ``materials``, -1 for none; None without any.
         materials: of the file.
+        notes: sentences on what of the file's shape is passed over.
     """
 
     vertices: Float64[np.ndarray, "v 3"]
@@ -49,6 +50,7 @@ class MeshShape:
     corner_alpha: Float32[np.ndarray, "f 3"] | None = None
     material_numbers: Int32[np.ndarray, " f"] | None = None
     materials: tuple[MeshMaterial, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def primitive_shape(name: str) -> MeshShape:
@@ -75,6 +77,7 @@ def read_shape(path: Path) -> MeshShape:
         corner_alpha=None if mesh.alpha is None else mesh.alpha[mesh.triangles],
         material_numbers=mesh.material_indices,
         materials=mesh.materials,
+        notes=mesh.notes,
     )
 
 
@@ -290,13 +293,15 @@ def _sphere_shape() -> MeshShape:
 
 
 def _cube_shape() -> MeshShape:
+    """Return a cube; images stand upright on its sides, and their tops are at -z above and at z below."""
     vertices: list[Float64[np.ndarray, 3]] = []
     faces: list[list[int]] = []
     uv: list[list[list[int]]] = []
     for axis in range(3):
         for sign in (-1.0, 1.0):
             n = np.eye(3)[axis] * sign
-            u = np.roll(n, 1) if sign > 0 else np.roll(-n, 2)
+            # to the right and up in the image, as seen from outside
+            u = np.eye(3)[0] if axis == 1 else np.cross([0, 1, 0], n)
             w = np.cross(n, u)
             first = len(vertices)
             vertices += [n - u - w, n + u - w, n + u + w, n - u + w]

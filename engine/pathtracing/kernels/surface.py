@@ -151,7 +151,8 @@ def eval_normal_map(
     """Perturb the shading normal s by the normal texture; ``normal`` is the face's, on the viewer's side.
 
     The frame follows the texture coordinates of the face: x where u grows, y where v shrinks, as v counts
-    downwards. s stays where the face has none, or where the viewer would see the new one from behind.
+    downwards. From the back of a face a bump is a dent: the normal is that of the front, reversed, as glTF
+    has it. s stays where the face has none, or where the viewer would see the new one from behind.
     """
     (u, v), uv = texture_uv, corner_uv
     (n_x, n_y, n_z), (s_x, s_y, s_z), (d_x, d_y, d_z) = normal, shading_normal, direction
@@ -192,8 +193,10 @@ def eval_normal_map(
     )
     x, y, z = eval_texture(materials, texture, u, v)
     scale = materials.normal_scales[m]
+    f_x, f_y, f_z = a_y * b_z - a_z * b_y, a_z * b_x - a_x * b_z, a_x * b_y - a_y * b_x
+    side = scale if f_x * n_x + f_y * n_y + f_z * n_z >= 0.0 else -scale
     # not below the surface
-    x, y, z = scale * (2.0 * x - 1.0), scale * (2.0 * y - 1.0), max(2.0 * z - 1.0, 1e-3)
+    x, y, z = side * (2.0 * x - 1.0), side * (2.0 * y - 1.0), max(2.0 * z - 1.0, 1e-3)
     x, y, z = normalize(x * t_x + y * w_x + z * s_x, x * t_y + y * w_y + z * s_y, x * t_z + y * w_z + z * s_z)
     if x * d_x + y * d_y + z * d_z > -1e-4 or x * n_x + y * n_y + z * n_z <= 0.0:
         return s_x, s_y, s_z
