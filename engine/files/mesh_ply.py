@@ -74,8 +74,8 @@ def read(path: Path) -> ImportedMesh:
     table = tables["vertex"]
     face = header.element("face")
     positions = np.empty((len(table), 3))
-    for axis, name in enumerate(_POSITION):
-        positions[:, axis] = table[name]
+    for axis, coordinate in enumerate(_POSITION):
+        positions[:, axis] = table[coordinate]
     triangles = np.zeros((0, 3), np.int64)
     if face is not None and face.count:
         name = next((prop.name for prop in face.lists if prop.name in _FACE_LISTS), None)
