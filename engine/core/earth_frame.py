@@ -1,10 +1,10 @@
 """Frames on the Earth: what a georeference's metres are in geocentric coordinates (EPSG:4978).
 
 These are metres from the centre of the Earth, x to latitude and longitude 0, z to the north pole. Latitudes
-and longitudes are on the ellipsoid of WGS 84. Of projected systems only those of UTM are known, on WGS 84 or
-ETRS89, which differ by less than a metre. Their inverse is the series of Krueger to the sixth order (Karney,
-"Transverse Mercator with an accuracy of a few nanometers", https://doi.org/10.1007/s00190-011-0445-3,
-equations 11, 21 and 36).
+and longitudes are on the ellipsoid of WGS 84. Of projected systems only those of UTM are known, on WGS 84,
+ETRS89 or NAD83, which differ by two metres at most. Their inverse is the series of Krueger to the sixth order
+(Karney, "Transverse Mercator with an accuracy of a few nanometers",
+https://doi.org/10.1007/s00190-011-0445-3, equations 11, 21 and 36).
 """
 
 import re
@@ -20,10 +20,10 @@ FLATTENING = 1.0 / 298.257223563
 _ECCENTRICITY_SQUARED = FLATTENING * (2.0 - FLATTENING)
 _UTM_SCALE = 0.9996
 _FALSE_EASTING_M, _FALSE_NORTHING_SOUTH_M = 500_000.0, 10_000_000.0
-_UTM_CODE = re.compile(r"EPSG:(326|327|258)([0-9]{2})")
-_SOUTH, _ETRS89 = "327", "258"
-_ZONES = range(1, 61)
-_ETRS89_ZONES = range(28, 39)
+_UTM_CODE = re.compile(r"EPSG:([0-9]{3})([0-9]{2})")
+_SOUTH = "327"
+_ZONES = {"326": range(1, 61), _SOUTH: range(1, 61), "258": range(28, 39), "269": range(1, 24)}
+"""By the first digits of the code: WGS 84, north and south, ETRS89 and NAD83."""
 _DIFFERENCE_M = 100.0
 """Half of the step by which directions of a projected system are found: their errors are below 1e-9."""
 
@@ -88,7 +88,7 @@ def _east_north_up(latitude_deg: float, longitude_deg: float, height_m: float) -
 
 def _utm_zone(crs: str) -> _UtmZone | None:
     match = _UTM_CODE.fullmatch(crs)
-    if match is None or int(match[2]) not in (_ETRS89_ZONES if match[1] == _ETRS89 else _ZONES):
+    if match is None or int(match[2]) not in _ZONES.get(match[1], ()):
         return None
     return _UtmZone(int(match[2]), match[1] == _SOUTH)
 

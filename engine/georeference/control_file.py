@@ -8,7 +8,7 @@ Two forms are read, told apart by their content:
 A CSV with a line of names: ``name,x,y,z,photograph,px,py``, a row for each sighting; a comment
 ``# EPSG:32632`` or ``# WGS84 UTM 32N`` says the coordinate system. A row without a photograph is one of a
 photograph (its camera's position) or of a sparse point (its number), by ``name``. Points without ``x,y,z``
-are for known lengths.
+are for known lengths. Semicolons or tabs may part the columns; numbers may have a decimal comma then.
 """
 
 import csv
@@ -20,24 +20,19 @@ from pathlib import Path
 import numpy as np
 
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.core.georeference import WGS84
+from octasplat.engine.georeference.coordinate_system import parse_crs, statement_in_comments
 
 CONTROL_FILES = ("gcp_list.txt", "control_points.csv")
 """Names in the folder of a scene that need not be given."""
 MAX_BYTES = 10_000_000
 _COLUMNS = {"image": "photograph", "im_x": "px", "im_y": "py", "label": "name", "gcp_name": "name"}
-_PROJECTED_AMONG_DEGREES = frozenset((*range(4491, 4555), 4647))
-"""EPSG codes of projected systems in metres, of CGCS2000 and of Germany, among those that give degrees."""
-_MERCATOR = frozenset((3395, 3785, 3857, 54004, 102100, 102113, 900913))
-"""EPSG codes, and others used as such, of the whole Earth on one map, with metres at the equator alone."""
-_FEET = frozenset((*range(2222, 2290), *range(3433, 3439)))
-"""EPSG codes of state planes of the USA (NAD83) in feet; those of later datums are not told from metres."""
-_EPSG = re.compile(r"EPSG", re.IGNORECASE)
-_LOCAL = re.compile(r"^local$", re.IGNORECASE)
-_OTHER_SYSTEM = re.compile(r"\bUTM\b|\+proj|\bWGS ?84\b", re.IGNORECASE)
-"""What a comment has that says a coordinate system, known or not."""
-_UTM = re.compile(r"WGS ?84 UTM ?(?:zone )?([0-9]{1,2}) ?([NS])", re.IGNORECASE)
-_PROJ_UTM = re.compile(r"\+proj=utm .*\+zone=([0-9]{1,2})", re.IGNORECASE)
+_NUMBERS = ("x", "y", "z", "px", "py")
+_KNOWN = ("name", "photograph", *_NUMBERS)
+_LIKE_A_POSITION = re.compile(
+    r"[xyz]\b|[enh]$|east|north|lon|lng|lat|height|alt|elev|rechts|hoch", re.IGNORECASE
+)
+"""What names of columns begin with that could be those of positions under other names."""
+_DELIMITERS = ",;\t"
 
 
 @dataclass(frozen=True)
@@ -78,8 +73,8 @@ class ControlFile:
 
     Attributes:
         path: of the file.
-        crs: EPSG code of the positions: :data:`WGS84` (x is the longitude then), or of projected ones in
-            metres, x east and y north; None of local metres.
+        crs: EPSG code of the positions: that of WGS 84 in degrees (x is the longitude then), or of projected
+            ones in metres, x east and y north; None of local metres.
         points: in the order of the file.
     """
 
@@ -105,39 +100,67 @@ def read_control_file(path: Path) -> ControlFile:
         ) from None
     numbered = [(number, line.strip()) for number, line in enumerate(lines, 1) if line.strip()]
     content = [(number, line) for number, line in numbered if not line.startswith("#")]
-    is_csv = bool(content) and "," in content[0][1] and "name" in _csv_names(content[0][1])
-    if is_csv:
-        comments = [line.lstrip("# ") for _, line in numbered if line.startswith("#")]
-        # a number comes first, then a plain "local"; any other system is read or refused, so that its points
-        # are not taken as local
-        patterns = (_EPSG, _LOCAL, _OTHER_SYSTEM)
-        found = [line for pattern in patterns for line in comments if pattern.search(line)]
-        stated = next(iter(found), "")
-        rows = _csv_rows(path, content)
+    delimiter = _delimiter(content[0][1]) if content else None
+    if delimiter is not None:
+        stated = statement_in_comments(line.lstrip("# ") for _, line in numbered if line.startswith("#"))
+        rows = _csv_rows(path, content, delimiter)
     else:
         stated = content[0][1] if content else ""
         rows = _list_rows(path, content[1:])
     points = _collect_points(path, rows)
     if not points:
         raise ConfigError(f"{path} holds no control points; write a line for each.")
-    return ControlFile(path, _parse_crs(path, stated), points)
+    return ControlFile(path, parse_crs(path, stated), points)
 
 
-def _csv_names(line: str) -> list[str]:
-    names = (name.strip().lower() for name in line.split(","))
+def _delimiter(line: str) -> str | None:
+    """Return what parts the columns of a CSV whose line of names this is; None where it is none."""
+    for delimiter in _DELIMITERS:
+        try:
+            names = _csv_names(line, delimiter)
+        except csv.Error:
+            continue
+        if len(names) > 1 and "name" in names:
+            return delimiter
+    return None
+
+
+def _csv_names(line: str, delimiter: str) -> list[str]:
+    names = (name.strip().lower() for name in next(csv.reader([line], delimiter=delimiter)))
     return [_COLUMNS.get(name, name) for name in names]
 
 
-def _csv_rows(path: Path, content: list[tuple[int, str]]) -> Iterator[tuple[int, Mapping[str, str]]]:
-    names = _csv_names(content[0][1])
+def _csv_rows(
+    path: Path, content: list[tuple[int, str]], delimiter: str
+) -> Iterator[tuple[int, Mapping[str, str]]]:
+    names = _csv_names(content[0][1], delimiter)
+    _check_names(path, content[0][0], names)
     for number, line in content[1:]:
         try:
-            values = [value.strip() for value in next(csv.reader([line]))]
+            values = [value.strip() for value in next(csv.reader([line], delimiter=delimiter))]
         except csv.Error as error:
             raise ConfigError(f"{path}, line {number}: cannot be read ({error}).") from None
         if len(values) > len(names):
             raise ConfigError(f"{path}, line {number}: has {len(values)} values for {len(names)} columns.")
-        yield number, dict(zip(names, values, strict=False))
+        row = dict(zip(names, values, strict=False))
+        if delimiter != ",":
+            row |= {key: row[key].replace(",", ".") for key in _NUMBERS if key in row}
+        yield number, row
+
+
+def _check_names(path: Path, line: int, names: list[str]) -> None:
+    """Refuse columns of which it is open what they are."""
+    twice = [name for name in _KNOWN if names.count(name) > 1]
+    if twice:
+        raise ConfigError(f"{path}, line {line}: there are two columns {twice[0]}; leave one.")
+    others = [name for name in names if name not in _KNOWN and _LIKE_A_POSITION.match(name)]
+    missing = [axis for axis in "xyz" if axis not in names]
+    if len(missing) in (1, 2) or (missing and others):
+        there = f", but {', '.join(others)}" if others else ""
+        raise ConfigError(
+            f"{path}, line {line}: there is no column {' and no '.join(missing)}{there}; call the columns of "
+            "the position x, y and z (x is the easting or the longitude)."
+        )
 
 
 def _list_rows(path: Path, content: list[tuple[int, str]]) -> Iterator[tuple[int, Mapping[str, str]]]:
@@ -162,9 +185,10 @@ def _collect_points(path: Path, rows: Iterator[tuple[int, Mapping[str, str]]]) -
         name = row.get("name", "")
         if not name:
             raise ConfigError(f"{path}, line {number}: the point has no name.")
-        position = _position(path, number, row)
-        if positions.setdefault(name, position) != position:
+        position, before = _position(path, number, row), positions.get(name)
+        if None not in (position, before) and position != before:
             raise ConfigError(f"{path}, line {number}: {name} has another position than before.")
+        positions[name] = before if position is None else position
         marks.setdefault(name, [])
         if row.get("photograph"):
             x, y = (_number(path, number, row, axis) for axis in ("px", "py"))
@@ -187,45 +211,3 @@ def _number(path: Path, line: int, row: Mapping[str, str], name: str) -> float:
     if not np.isfinite(value):
         raise ConfigError(f"{path}, line {line}: {name} is {row.get(name, '')!r}, which is no number.")
     return value
-
-
-def _parse_crs(path: Path, text: str) -> str | None:
-    """Return the EPSG code that a line states; None of local metres.
-
-    Raises:
-        ConfigError: another coordinate system than these are read in.
-    """
-    if found := re.search(r"EPSG:+([0-9]{4,6})", text, re.IGNORECASE):
-        code = int(found.group(1))
-        if code in (4326, 4979):
-            return WGS84
-        if 4000 <= code < 5000 and code not in _PROJECTED_AMONG_DEGREES:
-            raise ConfigError(
-                f"{path}: EPSG:{code} gives no metres east and north; write the points in EPSG:4326 or in a "
-                "projected system, such as UTM."
-            )
-        if code in _MERCATOR:
-            raise ConfigError(
-                f"{path}: lengths in EPSG:{code}, a map of the whole Earth, grow with the latitude, so "
-                "that they are no metres; write the points in EPSG:4326 or in UTM."
-            )
-        if code in _FEET:
-            raise ConfigError(
-                f"{path}: EPSG:{code} is in feet; write the points in EPSG:4326, in UTM or in the same "
-                "system in metres."
-            )
-        return f"EPSG:{code}"
-    utm, is_south = _UTM.search(text), "+south" in text
-    if utm is not None:
-        is_south = utm.group(2).upper() == "S"
-    else:
-        utm = _PROJ_UTM.search(text)
-    if utm is not None and 1 <= int(utm.group(1)) <= 60:
-        return f"EPSG:{32600 + 100 * is_south + int(utm.group(1))}"
-    if "+proj=longlat" in text or text.strip().upper() in ("WGS84", "WGS 84"):
-        return WGS84
-    if text.strip().lower() in ("", "local"):
-        return None
-    raise ConfigError(
-        f"{path}: the coordinate system {text[:60]!r} is not known; write EPSG: and its number, or local."
-    )

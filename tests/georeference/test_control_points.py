@@ -69,7 +69,7 @@ def find(
     return find_georeference(open_scene(scene, tmp_path / "cache"), request, note)
 
 
-@pytest.mark.parametrize("code", ["EPSG:4549", "EPSG:4647"])
+@pytest.mark.parametrize("code", ["EPSG:4549", "EPSG:4647", "EPSG:4471", "EPSG:4484"])
 def test_projected_systems_among_the_numbers_of_degrees_are_read(tmp_path: Path, code: str) -> None:
     path = tmp_path / "gcp_list.txt"
     path.write_text(f"{code}\n32691632.1 5334761.4 520.3 10 10 a.jpg a\n", encoding="utf-8")
@@ -85,6 +85,11 @@ def test_projected_systems_among_the_numbers_of_degrees_are_read(tmp_path: Path,
         ("# WGS84", "EPSG:4979"),
         ("# local metres", None),
         ("# by tape, not WGS84\n# local", None),
+        ("# WGS 84 / UTM zone 32N", "EPSG:32632"),
+        ("# EPSG: 32632", "EPSG:32632"),
+        ("# urn:ogc:def:crs:EPSG::32632", "EPSG:32632"),
+        ("# EPSG:32632+5773", "EPSG:32632"),
+        ("# +zone=10 +proj=utm +datum=NAD83 +units=m +no_defs", "EPSG:26910"),
     ],
 )
 def test_comments_of_a_csv_say_the_system(tmp_path: Path, comments: str, crs: str | None) -> None:
@@ -93,10 +98,99 @@ def test_comments_of_a_csv_say_the_system(tmp_path: Path, comments: str, crs: st
     assert read_control_file(path).crs == crs
 
 
-def test_unknown_system_in_a_comment_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("system", ["UTM zone 32", "ETRS89, zone 32", "ESRI:102039", "EPSG:3857123"])
+def test_unknown_system_in_a_comment_is_refused(tmp_path: Path, system: str) -> None:
     path = tmp_path / "control_points.csv"
-    path.write_text("# UTM zone 32\nname,x,y,z\na.jpg,691632.1,5334761.4,520\n", encoding="utf-8")
-    with pytest.raises(ConfigError, match="'UTM zone 32' is not known"):
+    path.write_text(f"# {system}\nname,x,y,z\na.jpg,691632.1,5334761.4,520\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match=f"'{system}' is not known"):
+        read_control_file(path)
+
+
+@pytest.mark.parametrize(
+    "system",
+    [
+        "+proj=utm +zone=10 +datum=WGS84 +units=us-ft +no_defs",
+        "+proj=utm +zone=10 +datum=NAD27 +units=m",
+        "+proj=utm +zone=32 +ellps=intl +towgs84=-87,-98,-121 +units=m",
+        "+proj=longlat +datum=NAD27",
+        "+proj=utm +zone=32 +units=km",
+    ],
+)
+def test_other_units_and_ellipsoids_of_a_proj_string_are_refused(tmp_path: Path, system: str) -> None:
+    path = tmp_path / "gcp_list.txt"
+    path.write_text(f"{system}\n691632.1 5334761.4 520.3 10 10 a.jpg a\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match="is not known"):
+        read_control_file(path)
+
+
+@pytest.mark.parametrize(
+    ("code", "message"),
+    [
+        ("26741", "in feet or another unit"),  # NAD27 / California zone I
+        ("6418", "in feet or another unit"),  # NAD83(2011) / California zone 1
+        ("32056", "in feet or another unit"),  # NAD27 / Wyoming
+        ("6318", "gives no metres"),  # NAD83(2011), degrees
+        ("7844", "gives no metres"),  # GDA2020, degrees
+        ("5773", "gives no metres"),  # heights alone
+        ("2048", "counts to the west"),  # Hartebeesthoek94 / Lo19
+        ("5513", "counts to the west"),  # S-JTSK / Krovak
+        ("4087", "a map of the whole Earth"),
+        ("32632+6360", "heights of EPSG:6360"),  # NAVD88 in feet
+    ],
+)
+def test_numbers_that_give_no_metres_are_refused(tmp_path: Path, code: str, message: str) -> None:
+    path = tmp_path / "gcp_list.txt"
+    path.write_text(f"EPSG:{code}\n1 2 3 10 10 a.jpg a\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match=message):
+        read_control_file(path)
+
+
+@pytest.mark.parametrize("newline", ["\n", "\r\n"])
+@pytest.mark.parametrize(
+    ("delimiter", "first"),
+    [
+        (",", "A,691632.1,5334761.4,520.3,a.jpg,1.5,2"),
+        (",", '"A","691632.1","5334761.4","520.3","a.jpg","1.5","2"'),
+        (";", "A;691632,1;5334761,4;520,3;a.jpg;1,5;2"),
+        (";", "A;691632.1;5334761.4;520.3;a.jpg;1.5;2"),
+        ("\t", "A\t691632.1\t5334761.4\t520.3\ta.jpg\t1.5\t2"),
+    ],
+    ids=["comma", "quoted", "decimal comma", "semicolon", "tab"],
+)
+def test_tables_as_spreadsheets_save_them_are_read(
+    tmp_path: Path, delimiter: str, first: str, newline: str
+) -> None:
+    names = ["name", "x", "y", "z", "photograph", "px", "py"]
+    head = delimiter.join(f'"{name}"' if first.startswith('"') else name for name in names)
+    second = delimiter.join(["A", "", "", "", "b.jpg", "3", "4"])  # the position is not repeated
+    path = tmp_path / "points.csv"
+    text = "\n".join(["# EPSG:32632", head, first, second, ""])
+    path.write_text(text, encoding="utf-8-sig", newline=newline)
+    found = read_control_file(path)
+    (point,) = found.points
+    assert found.crs == "EPSG:32632"
+    assert point.name == "A" and point.position == (691632.1, 5334761.4, 520.3)
+    assert [(mark.photograph, mark.x_px, mark.y_px) for mark in point.marks] == [
+        ("a.jpg", 1.5, 2.0),
+        ("b.jpg", 3.0, 4.0),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("head", "message"),
+    [
+        ("name,easting,northing,height", "no column x and no y and no z, but easting, northing, height"),
+        ("name,latitude,longitude,altitude", "but latitude, longitude, altitude"),
+        ("name,x,y,elevation", "no column z, but elevation"),
+        ("label,name,x,y,z", "two columns name"),
+    ],
+)
+def test_positions_under_other_names_are_refused_rather_than_left_out(
+    tmp_path: Path, head: str, message: str
+) -> None:
+    path = tmp_path / "points.csv"
+    path.write_text(f"# EPSG:32632\n{head}\na,1,2,3\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match=message):
         read_control_file(path)
 
 
@@ -213,7 +307,7 @@ def test_known_length_corrects_the_scale_of_gps(scene, tmp_path):
         ("EPSG:32632\n1 2 3 10 10 nothing.png a", "line 2: there is no photograph nothing.png"),
         ("EPSG:4258\n1 2 3 10 10 NAME a", "EPSG:4258 gives no metres"),
         ("EPSG:3857\n1 2 3 10 10 NAME a", "lengths in EPSG:3857, a map of the whole Earth, grow"),
-        ("EPSG:2263\n1 2 3 10 10 NAME a", "EPSG:2263 is in feet; write"),
+        ("EPSG:2263\n1 2 3 10 10 NAME a", "EPSG:2263 is in feet or another unit"),
         ("somewhere\n1 2 3 10 10 NAME a", "coordinate system 'somewhere' is not known"),
         ("WGS84 UTM 61N\n1 2 3 10 10 NAME a", "coordinate system 'WGS84 UTM 61N' is not known"),
         ("+proj=utm +zone=0\n1 2 3 10 10 NAME a", "coordinate system .*zone=0' is not known"),

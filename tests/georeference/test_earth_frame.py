@@ -68,6 +68,12 @@ def test_metres_are_east_north_and_up_of_the_anchor():
             (4014616.152745, 424842.208734, 4921487.421123),
             (4014525.949543, 424929.102748, 4921553.057370),
         ),
+        (
+            "EPSG:26910",
+            (551000.0, 4181000.0, 15.0),
+            (-2706290.988906, -4260998.370907, 3885736.203866),
+            (-2706173.372859, -4261000.928056, 3885814.783411),
+        ),
     ],
 )
 def test_metres_of_utm_follow_its_grid(crs, anchor, here, away):
@@ -81,7 +87,7 @@ def test_metres_of_utm_follow_its_grid(crs, anchor, here, away):
     assert np.linalg.norm(apart) < 2.0 * MILLIMETRE
 
 
-@pytest.mark.parametrize("crs", ["EPSG:2056", "EPSG:32661", "EPSG:25850", "EPSG:32600"])
+@pytest.mark.parametrize("crs", ["EPSG:2056", "EPSG:32661", "EPSG:25850", "EPSG:32600", "EPSG:26924"])
 def test_other_systems_are_not_known(crs):
     given = Georeference(crs=crs, anchor=(2600000.0, 1200000.0, 500.0), matrix=matrix_rows(np.eye(4)))
     assert geocentric_from_metres(given) is None
