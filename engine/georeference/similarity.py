@@ -84,6 +84,8 @@ def fit_similarity(
             raise SimilarityError(
                 f"lie in one point or on one line {where}, which leaves the turn about it open"
             )
+    if not spread > 1e-6 * float(np.linalg.norm(target, axis=1).max()):
+        raise SimilarityError("lie in one place on the ground, half of them or more")
     options = pycolmap.RANSACOptions(
         max_error=max(min(tolerance * spread, max_tolerance_m), 1e-6 * spread), random_seed=0
     )

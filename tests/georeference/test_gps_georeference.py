@@ -90,8 +90,12 @@ def test_wrong_positions_are_left_out_by_name(scene, tmp_path):
             lambda metres, rng: {name: place + rng.normal(0, 30, 3) for name, place in metres.items()},
             "contradict|nearly on a line",
         ),
+        (
+            lambda metres, rng: {n: place * (k < 4) for k, (n, place) in enumerate(metres.items())},
+            "lie in one place on the ground, half of them or more",
+        ),
     ],
-    ids=["elsewhere", "two", "line", "noise"],
+    ids=["elsewhere", "two", "line", "noise", "one fix"],
 )
 def test_useless_gps_is_said_or_refused(scene, tmp_path, change, reason):
     write_gps(scene, change(true_metres(scene), np.random.default_rng(1)))
