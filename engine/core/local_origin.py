@@ -72,29 +72,46 @@ def user_position(position: Float[np.ndarray, "3"], origin: Origin) -> str:
     return " ".join(f"{value + start:.11g}" for value, start in zip(position.tolist(), origin, strict=True))
 
 
-def vertices_about(vertices: Float64[np.ndarray, "v 3"], origin: Origin) -> Float64[np.ndarray, "v 3"]:
+def vertices_about(
+    vertices: Float64[np.ndarray, "v 3"], origin: Origin, *, has_same_axes: bool = False
+) -> Float64[np.ndarray, "v 3"]:
     """Return vertices of a file relative to a local origin, whichever of the two frames the file uses.
 
     Programs either apply the transform of a file's root node or leave it out, and may turn axes. As the
     origin is far from the scene, the vertices themselves show which is the case.
 
     Args:
-        vertices: as a file gives them, along whatever axes.
+        vertices: as a file gives them.
         origin: of the scene that they belong to.
+        has_same_axes: whether they are along the axes of the scene; else they are along whatever axes.
     """
     if not is_set(origin) or len(vertices) == 0:
         return vertices
     centre = np.median(vertices, axis=0)
-    values = np.array(origin)
-    # All 48 signed permutations of the axes, as files differ in what is up and in handedness
-    turned = [
-        np.array(signs) * values[list(order)]
-        for order in itertools.permutations(range(3))
-        for signs in itertools.product((1.0, -1.0), repeat=3)
-    ]
-    nearest = min(turned, key=lambda candidate: float(np.linalg.norm(centre - candidate)))
-    is_far = np.linalg.norm(centre - nearest) < np.linalg.norm(centre) / 2
-    return vertices - nearest if is_far else vertices
+    start = np.array(origin) if has_same_axes else _turned_origin(vertices, centre, origin)
+    is_far = np.linalg.norm(centre - start) < np.linalg.norm(centre) / 2
+    return vertices - start if is_far else vertices
+
+
+def _turned_origin(
+    vertices: Float64[np.ndarray, "v 3"], centre: Float64[np.ndarray, "3"], origin: Origin
+) -> Float64[np.ndarray, "3"]:
+    """Return the origin along the axes of vertices, as near to their centre as it can be.
+
+    Files differ in what is up, and a few in handedness, too: what mirrors counts only where it is clearly
+    nearer, as heights are small beside map coordinates, and what lies below the sea is not mirrored.
+    """
+    nearest: dict[bool, tuple[float, np.ndarray]] = {}
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            mirrors = bool(np.linalg.det(np.diag(signs)[:, list(order)]) < 0)
+            turned = np.array(signs) * np.array(origin)[list(order)]
+            distance = float(np.linalg.norm(centre - turned))
+            if mirrors not in nearest or distance < nearest[mirrors][0]:
+                nearest[mirrors] = distance, turned
+    size = float(np.median(np.linalg.norm(vertices - centre, axis=1)))
+    mirrors = 2.0 * nearest[True][0] + size < nearest[False][0]
+    return nearest[mirrors][1]
 
 
 def local_map(

@@ -361,7 +361,8 @@ def _decode(
     ):
         of_geometry = None
         if geometry is not None:
-            of_geometry = GeometryDepths(geometry.read().about(model.origin_world), threads)
+            mesh = geometry.read().about(model.origin_world, has_same_axes=True)
+            of_geometry = GeometryDepths(mesh, threads)
         paths = (view.depth_path for view in model.views)
         decoded = read_ahead(_read_if_there, paths, pool, 2 * workers)
         for view, found in zip(model.views, decoded, strict=True):

@@ -62,9 +62,16 @@ class ImportedMesh:
     def __len__(self) -> int:
         return len(self.vertices)
 
-    def about(self, origin: Origin) -> "ImportedMesh":
-        """Return the mesh about the local origin of a scene, whichever coordinates its file has."""
-        return replace(self, vertices=vertices_about(self.vertices, origin)) if is_set(origin) else self
+    def about(self, origin: Origin, *, has_same_axes: bool = False) -> "ImportedMesh":
+        """Return the mesh about the local origin of a scene, whichever coordinates its file has.
+
+        Args:
+            origin: of the scene.
+            has_same_axes: whether the mesh is along the axes of the scene, as no program turned it.
+        """
+        if not is_set(origin):
+            return self
+        return replace(self, vertices=vertices_about(self.vertices, origin, has_same_axes=has_same_axes))
 
 
 def flip_v(uv: Float32[np.ndarray, "v 2"]) -> Float32[np.ndarray, "v 2"]:

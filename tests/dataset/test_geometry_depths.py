@@ -175,6 +175,24 @@ def test_true_mesh_gives_the_distances_of_true_depth_maps(with_geometry: Path, t
         assert np.median(np.abs(found[both] / expected[both] - 1)) < 2e-3
 
 
+def test_geometry_below_zero_stays_in_place_in_map_coordinates(with_geometry: Path, tmp_path: Path) -> None:
+    near = open_dataset(with_geometry, tmp_path / "near")
+    offset = np.array([512_345.25, 5_403_210.5, -0.49])  # cameras stand above zero, the floor lies below
+    mesh = read_mesh(with_geometry / "geometry.ply")
+    lines = [f"v {x:.12g} {y:.12g} {z:.12g}" for x, y, z in mesh.vertices + offset]
+    lines += [f"f {a} {b} {c}" for a, b, c in mesh.triangles + 1]
+    (with_geometry / "geometry.ply").unlink()
+    (with_geometry / "geometry.obj").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    folder = load_dataset_model(with_geometry).model_folder
+    model = pycolmap.Reconstruction(str(folder))
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), offset))
+    model.write_binary(str(folder))
+    far = open_dataset(with_geometry, tmp_path / "far")
+    assert far.origin_world[2] == 1.0
+    for view in range(len(far.views)):
+        np.testing.assert_allclose(known_distances(far, view), known_distances(near, view), rtol=1e-3)
+
+
 def test_photographs_with_a_map_of_their_own_keep_it(with_geometry: Path, tmp_path: Path) -> None:
     maps = sorted((with_geometry / "ground_truth" / "depth").iterdir())
     (with_geometry / "depths").mkdir()

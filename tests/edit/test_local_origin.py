@@ -66,6 +66,23 @@ def test_glb_says_the_position_to_programs_that_know_nothing_of_us(far, tmp_path
     assert np.abs(local).max() < 5.0
 
 
+@pytest.mark.parametrize(
+    ("axes", "height"),
+    [
+        (np.eye(3), -45.0),
+        (np.diag([1.0, -1, -1]), -45.0),
+        (np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), -45.0),
+        (np.diag([-1.0, 1, 1]), 5.0),
+    ],
+    ids=["as the scene", "half turn", "y up", "mirrored"],
+)
+def test_meshes_below_the_sea_are_put_about_an_origin_above_it(axes: np.ndarray, height: float) -> None:
+    origin = (512_350.0, 5_403_210.0, 40.0)
+    local = np.random.default_rng(0).uniform(-20, 20, (200, 3)) + np.array([0.0, 0.0, height])
+    found = vertices_about((local + origin) @ axes.T, origin)
+    np.testing.assert_allclose(found, local @ axes.T, atol=1e-6)
+
+
 def test_edited_mesh_of_large_coordinates_finds_its_gaussians(octasplat, far, tmp_path) -> None:
     for name in ("mesh.glb", "mesh.ply", "mesh.obj"):
         assert octasplat("export", far, tmp_path / name).exit_code == 0
