@@ -23,6 +23,8 @@ WGS84 = "EPSG:4979"
 """Latitude and longitude in degrees, and height above the ellipsoid in metres."""
 TOLERANCE = 1e-6
 """Of the scale: how far a matrix may be from a similarity."""
+ROUNDING = 1e-12
+"""Of the largest number of a matrix: formats that turn a scene keep its matrix as well as this."""
 
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
 _Row = tuple[_Finite, _Finite, _Finite, _Finite]
@@ -100,6 +102,13 @@ class Georeference(_FrozenModel):
             return None
         moved = self.metres_from_scene @ np.linalg.inv(np.asarray(matrix, np.float64))
         return self.model_copy(update={"matrix": matrix_rows(moved)})
+
+    def is_same_place(self, other: "Georeference") -> bool:
+        """Return whether another georeference says the same, but for rounding of files."""
+        one, two = np.array(self.matrix), np.array(other.matrix)
+        tolerance = ROUNDING * float(np.abs(one).max())
+        is_close = bool(np.allclose(one, two, rtol=0, atol=tolerance))
+        return is_close and (self.crs, self.anchor) == (other.crs, other.anchor)
 
     def describe(self) -> str:
         """Return scale and place in a few words, e.g. for a report."""

@@ -45,12 +45,12 @@ def merge_metadata(scenes: Sequence[tuple[FlatGaussians, SceneMetadata]]) -> Sce
     """
     known = [facts.georeference for _, facts in scenes if facts.georeference is not None]
     # scene files keep neither the method nor the residuals
-    places = {(place.crs, place.anchor, place.matrix) for place in known}
+    is_common = bool(known) and all(place.is_same_place(known[0]) for place in known[1:])
     lit = [facts.turned_beyond for gaussians, facts in scenes if ALBEDO in gaussians.channels]
     return SceneMetadata(
         near_world=min(facts.near_world for _, facts in scenes),
         pixel_rad=min(facts.pixel_rad for _, facts in scenes),
         turned_beyond=min(lit, default=0.0),
         origin_world=scenes[0][1].origin_world,
-        georeference=known[0] if len(places) == 1 else None,
+        georeference=known[0] if is_common else None,
     )
