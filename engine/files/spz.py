@@ -189,8 +189,13 @@ def _pack_scales(scene: FlatGaussians) -> bytes:
 
 def _fitting_bits(scene: FlatGaussians) -> int:
     """Return how many fractional bits the farthest position leaves; negative where it has no room."""
-    largest = _farthest(scene)
-    return int(np.floor(np.log2((2**23 - 1) / max(largest, 1.0 / 256.0))))  # 2^bits |x| <= 2^23 - 1
+    return int(np.floor(-np.log2(least_step(_farthest(scene)))))
+
+
+def least_step(farthest: Float[np.ndarray, "..."] | float) -> Float[np.ndarray, "..."] | float:
+    """Return the step of positions that largest absolute coordinates leave, a power of two."""
+    # 2^bits |x| <= 2^23 - 1
+    return 2.0 ** -np.floor(np.log2((2**23 - 1) / np.maximum(farthest, 1.0 / 256.0)))
 
 
 def _farthest(scene: FlatGaussians) -> float:

@@ -20,9 +20,10 @@ from octasplat.engine.files.compressed_khr_glb import EXTENSIONS, write_compress
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.folders_of_parts import former_folders, move_into_place
 from octasplat.engine.files.kd_cells import halve_points
+from octasplat.engine.files.range_losses import find_position_losses
 from octasplat.engine.files.registry import Exporter, register
 from octasplat.engine.files.splat_rows import iterate_blocks, select_for_export
-from octasplat.engine.files.spz import find_range_losses
+from octasplat.engine.files.spz import find_range_losses, least_step
 from octasplat.engine.files.tile_tree import TileContent, tileset_json
 from octasplat.engine.gaussians.levels_of_detail import iterate_levels, level_counts
 from octasplat.engine.gaussians.model import FlatGaussians
@@ -135,7 +136,23 @@ def _find_losses(scene: FlatGaussians) -> tuple[str, ...]:
     if len(scene) == 0 or not scene.is_finite():
         return ()  # which is refused
     sizes, harmonics = find_range_losses(FORMAT, scene)
-    return (*sizes, *harmonics)
+    return (*sizes, *_find_position_losses(scene), *harmonics)
+
+
+def _find_position_losses(scene: FlatGaussians) -> tuple[str, ...]:
+    """Return what becomes of Gaussians that share a tile with others far away."""
+    means = scene.means_world
+    whole = least_step(float((means.max(axis=0).astype(np.float64) - means.min(axis=0)).max()) / 2.0)
+    if not find_position_losses(FORMAT, scene, lambda _rows: float(whole)):
+        return ()  # no tile is larger than the scene
+    depth = len(level_counts(len(scene), FEWEST_IN_ROOT)) - 1
+    numbers = halve_points(means, depth).cells_of(means, depth)
+    farthest = np.zeros(int(numbers.max()) + 1)
+    for cell, part in _parts(scene.with_base_color_only(), numbers):
+        low, high = part.means_world.min(axis=0), part.means_world.max(axis=0)
+        farthest[cell] = float((high.astype(np.float64) - low).max()) / 2.0
+    steps = np.asarray(least_step(farthest))
+    return find_position_losses(FORMAT, scene, lambda rows: steps[numbers[rows]])
 
 
 def _find_place_losses(facts: SceneMetadata) -> tuple[str, ...]:

@@ -276,3 +276,21 @@ def test_unfit_scenes_are_refused(scene: FlatGaussians, tmp_path: Path) -> None:
     with pytest.raises(SceneFileError, match="SPZ holds positions up to 8388607 units"):
         export_scene(replace(scene, means_world=means), tmp_path / "out" / "tileset.json")
     assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_positions_that_share_a_tile_with_far_ones_are_told(scene: FlatGaussians, tmp_path: Path) -> None:
+    facts = SceneMetadata(georeference=georeference())
+    index = tmp_path / "out" / "tileset.json"
+    assert dropped_on_export(scene, [index], facts=facts) == ()
+    means = scene.means_world.copy()
+    means[:2] = [[2.0e6, 3.0, -2.0], [-2.0e6, 20.0, 1.0]]
+    far = replace(scene, means_world=means)
+    (text,) = dropped_on_export(far, [index], facts=facts)
+    assert "holds positions in steps of" in text
+    index, *_ = export_scene(far, index, ExportOptions(facts=facts))
+    leaves = [tile for tile, depth in walk(tileset_of(index)["root"]) if depth == 3]
+    found = np.concatenate([cloud_of(index, tile).means_world for tile in leaves])
+    apart = np.linalg.norm(found[:, None] - means[None, 2:], axis=2).min(axis=0)
+    sizes = far.scales[2:].max(axis=1)
+    told = int(text.split("size of ")[1].split(" of ")[0].replace(",", ""))
+    assert 0 < (apart > sizes).sum() <= told < len(scene)
