@@ -215,13 +215,13 @@ def run(
     # where a file is to be written there is room for a large scene, too
     folder = next((path.parent for path in request.files if path.parent.is_dir()), None)
     gaussians = open_scene(request.source, progress, folder=folder)
-    if request.materials:  # materials are what is asked for: what is lost of the harmonics does not matter
+    if request.materials:
         require_materials(gaussians, request.source)
-    else:
-        for text in dropped_on_export(
-            gaussians, list(request.files), request.format, facts=read_metadata(request.source)
-        ):
-            progress(Warned(text))
+    # of a lit mesh materials are what is asked for: what is lost of the harmonics does not matter
+    lit = "glb" if request.materials else None
+    told = [path for path, exporter in zip(request.files, found, strict=True) if exporter.name != lit]
+    for text in dropped_on_export(gaussians, told, request.format, facts=read_metadata(request.source)):
+        progress(Warned(text))
 
     def step(done: int) -> None:
         if done < count and should_stop():  # after the last file there is nothing to stop

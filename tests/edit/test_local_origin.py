@@ -57,6 +57,21 @@ def test_formats_without_a_place_for_the_origin_are_named(octasplat, far, tmp_pa
     )
 
 
+def test_losses_of_files_beside_a_lit_mesh_are_told(octasplat, make_scene, tmp_path) -> None:
+    scene = make_scene(40)
+    materials = {"albedo": np.full((40, 3), 0.5, np.float32)}
+    materials |= {name: np.full((40, 1), 0.5, np.float32) for name in ("metallic", "roughness")}
+    facts = SceneMetadata(origin_world=ORIGIN)
+    write_gaussian_ply(scene.with_channels(materials), tmp_path / "far.ply", facts=facts)
+    files = (tmp_path / "lit.glb", tmp_path / "small.spz")
+    result = octasplat("export", tmp_path / "far.ply", *files, "--materials")
+    assert result.exit_code == 0, result.output
+    output = " ".join(result.output.split())
+    assert "The format spz has no place for the origin of large coordinates" in output
+    assert "format glb" not in output
+    assert "no place" not in octasplat("export", tmp_path / "far.ply", files[0], "--materials").output
+
+
 def test_glb_says_the_position_to_programs_that_know_nothing_of_us(far, tmp_path) -> None:
     gaussians, facts = read_scene(far)[0], read_metadata(far)
     export_scene(gaussians, tmp_path / "mesh.glb", ExportOptions(facts=facts))
