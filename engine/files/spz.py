@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Float64
 
 from octasplat.engine.core.color import round_to_bytes
 from octasplat.engine.core.errors import SceneFileError
@@ -192,10 +192,10 @@ def _fitting_bits(scene: FlatGaussians) -> int:
     return int(np.floor(-np.log2(least_step(_farthest(scene)))))
 
 
-def least_step(farthest: Float[np.ndarray, "..."] | float) -> Float[np.ndarray, "..."] | float:
+def least_step(farthest: Float64[np.ndarray, "..."] | float) -> Float64[np.ndarray, "..."]:
     """Return the step of positions that largest absolute coordinates leave, a power of two."""
     # 2^bits |x| <= 2^23 - 1
-    return 2.0 ** -np.floor(np.log2((2**23 - 1) / np.maximum(farthest, 1.0 / 256.0)))
+    return np.asarray(2.0 ** -np.floor(np.log2((2**23 - 1) / np.maximum(farthest, 1.0 / 256.0))))
 
 
 def _farthest(scene: FlatGaussians) -> float:

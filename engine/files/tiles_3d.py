@@ -151,7 +151,7 @@ def _find_position_losses(scene: FlatGaussians) -> tuple[str, ...]:
     for cell, part in _parts(scene.with_base_color_only(), numbers):
         low, high = part.means_world.min(axis=0), part.means_world.max(axis=0)
         farthest[cell] = float((high.astype(np.float64) - low).max()) / 2.0
-    steps = np.asarray(least_step(farthest))
+    steps = least_step(farthest)
     return find_position_losses(FORMAT, scene, lambda rows: steps[numbers[rows]])
 
 
