@@ -4,11 +4,19 @@ import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+import pyproj
+
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.georeference import WGS84
-from octasplat.engine.georeference import epsg_numbers
 
 _DEGREES = (4326, 4979)
+_METHODS_OF_THE_EARTH = (
+    "Popular Visualisation Pseudo Mercator", "Mercator", "Equidistant Cylindrical",
+    "Lambert Cylindrical Equal Area", "Equal Earth",
+)  # fmt: skip
+"""First words of the methods of maps of the whole Earth, whose units are metres along a line alone."""
+_DIRECTIONS = (["east", "north"], ["north", "north"], ["south", "south"])
+"""Of the axes, sorted; maps of a pole name the directions along two meridians."""
 _EPSG = re.compile(r"EPSG", re.IGNORECASE)
 _CODE = re.compile(
     r"EPSG\s*:+\s*([0-9]{4,6})(?![0-9]|\.[0-9])(?:\s*\+\s*(?:EPSG\s*:+\s*)?([0-9]{4,6}))?", re.IGNORECASE
@@ -72,32 +80,58 @@ def parse_crs(path: Path, text: str) -> str | None:
     )
 
 
-def _checked_code(path: Path, code: int, heights: int | None) -> str:
-    if heights in epsg_numbers.not_heights():
-        raise ConfigError(f"{path}: the heights of EPSG:{heights} are no metres upwards; write such heights.")
+def _checked_code(path: Path, code: int, heights_code: int | None) -> str:
     if code in _DEGREES:
+        system, heights = None, _system(path, heights_code)
+    else:
+        system, heights = _system(path, code), _system(path, heights_code)
+        assert system is not None
+        if system.is_compound:
+            system, heights = system.sub_crs_list[0], heights or system.sub_crs_list[1]
+    upwards = [] if heights is None else [(a.direction, a.unit_conversion_factor) for a in heights.axis_info]
+    if heights is not None and upwards != [("up", 1.0)]:
+        raise ConfigError(f"{path}: the heights of {heights.name} are no metres upwards; write such heights.")
+    if system is None:
         return WGS84
-    if code in epsg_numbers.not_projected():
+    if not system.is_projected:
         raise ConfigError(
             f"{path}: EPSG:{code} gives no metres east and north; write the points in EPSG:4326 or in a "
             "projected system, such as UTM."
         )
-    if code in epsg_numbers.of_the_earth():
+    method = system.coordinate_operation.method_name if system.coordinate_operation else ""
+    if method.startswith(_METHODS_OF_THE_EARTH):
         raise ConfigError(
             f"{path}: lengths in EPSG:{code}, a map of the whole Earth, grow with the latitude, so "
             "that they are no metres; write the points in EPSG:4326 or in UTM."
         )
-    if code in epsg_numbers.not_metres():
+    plane = system.axis_info[:2]
+    if any(axis.unit_conversion_factor != 1.0 for axis in plane):
         raise ConfigError(
             f"{path}: EPSG:{code} is in feet or another unit than metres; write the points in EPSG:4326, in "
             "UTM or in the same system in metres."
         )
-    if code in epsg_numbers.turned():
+    if sorted(axis.direction for axis in plane) not in _DIRECTIONS:
         raise ConfigError(
             f"{path}: EPSG:{code} counts to the west or to the south; write the points in EPSG:4326, in UTM "
             "or in another system that counts to the east and to the north."
         )
     return f"EPSG:{code}"
+
+
+def _system(path: Path, code: int | None) -> pyproj.CRS | None:
+    """Return the coordinate system of a number; None of None.
+
+    Raises:
+        ConfigError: PROJ's copy of the EPSG dataset has no such number.
+    """
+    if code is None:
+        return None
+    try:
+        return pyproj.CRS.from_epsg(code)
+    except pyproj.exceptions.CRSError:
+        raise ConfigError(
+            f"{path}: EPSG:{code} is no coordinate system; write the points in EPSG:4326 or in UTM."
+        ) from None
 
 
 def _code_of_proj(text: str) -> str | None:

@@ -135,7 +135,9 @@ def test_other_units_and_ellipsoids_of_a_proj_string_are_refused(tmp_path: Path,
         ("2048", "counts to the west"),  # Hartebeesthoek94 / Lo19
         ("5513", "counts to the west"),  # S-JTSK / Krovak
         ("4087", "a map of the whole Earth"),
-        ("32632+6360", "heights of EPSG:6360"),  # NAVD88 in feet
+        ("2263", "in feet or another unit"),  # NAD83 / New York Long Island
+        ("99999", "is no coordinate system"),
+        ("32632+6360", "heights of NAVD88"),  # NAVD88 in feet
     ],
 )
 def test_numbers_that_give_no_metres_are_refused(tmp_path: Path, code: str, message: str) -> None:
