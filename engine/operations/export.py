@@ -219,8 +219,8 @@ def run(
         require_materials(gaussians, request.source)
     # of a lit mesh materials are what is asked for: what is lost of the harmonics does not matter
     lit = "glb" if request.materials else None
-    told = [path for path, exporter in zip(request.files, found, strict=True) if exporter.name != lit]
-    for text in dropped_on_export(gaussians, told, request.format, facts=read_metadata(request.source)):
+    lossy = [path for path, exporter in zip(request.files, found, strict=True) if exporter.name != lit]
+    for text in dropped_on_export(gaussians, lossy, request.format, facts=read_metadata(request.source)):
         progress(Warned(text))
 
     def step(done: int) -> None:
