@@ -120,7 +120,8 @@ def estimate_blocks(
     if fits_together(config.train, counts, [block.share for block in shares], most_gaussians):
         last_seconds = FINISH_FRACTION * sum(last_pieces)
         block_bytes.append(whole.memory_bytes)
-    extra = coarse.stage_seconds["train"] + last_seconds
+    # photographs are decoded once more, smaller, for the coarse scene
+    extra = coarse.stage_seconds["load"] + coarse.stage_seconds["train"] + last_seconds
     longer = extra + sum(block_seconds) - whole.stage_seconds["train"]
     seconds = whole.seconds + longer
     total = whole.model_copy(
