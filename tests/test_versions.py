@@ -8,8 +8,9 @@ from pathlib import Path
 from octasplat.engine.core.versions import package_versions
 
 ROOT = Path(__file__).resolve().parent.parent
-HARMLESS = {"pydantic", "pydantic_core", "jaxtyping", "Jinja2", "pyoidn", "platformdirs"}
-"""Checks of values, layout of the report, denoiser of stages, places of folders: no figure is theirs."""
+HARMLESS = {"pydantic", "pydantic_core", "jaxtyping", "Jinja2", "pyoidn", "platformdirs", "pyproj"}
+"""Checks of values, layout of the report, denoiser of stages, places of folders, meanings of EPSG numbers: no
+figure is theirs."""
 
 
 def imported_names(module: str) -> set[str]:

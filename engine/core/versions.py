@@ -23,7 +23,7 @@ PACKAGES = (
 )
 
 
-RESULTS_VERSION = 8
+RESULTS_VERSION = 9
 """Raised whenever the same settings give other results than before: what was begun under one number is begun
 anew under another, rather than gone on with."""
 
