@@ -25,7 +25,7 @@ _MATCH_CPU_SECONDS_PER_PAIR = 0.1
 _PRESELECT_CPU_SECONDS_PER_PAIR = 0.002
 _MAP_CPU_SECONDS_PER_PHOTOGRAPH = 0.2
 """For finding poses, measured with 14 photographs of 960 x 638 pixels and 25 of 538 x 960."""
-_LARGE_FEATURES_CPU_SECONDS_PER_PIXEL = 5.0e-7
+_LARGE_FEATURES_CPU_SECONDS_PER_PIXEL = 7.0e-7
 _LARGE_MATCH_CPU_SECONDS_PER_PAIR = 0.077
 _LARGE_MAP_CPU_SECONDS_PER_PHOTOGRAPH = 1.1
 """The same in captures of more photographs than ``quick_look_up_to``, measured with 2,000 of 12 MP."""
@@ -38,7 +38,8 @@ _DECODE_CPU_SECONDS_PER_PIXEL = 1.2e-8
 _LOAD_CPU_SECONDS_PER_PIXEL = 2.0e-8
 """Measured with 2,000 JPEG files of 12 MP: 1.3e-8; PNG takes longer."""
 _LIFT_CPU_SECONDS_PER_POINT = 7.0e-5
-_EVALUATE_CPU_SECONDS_PER_PIXEL = 2.7e-6
+_EVALUATE_CPU_SECONDS_PER_PIXEL = 4.5e-6
+"""Between 2.7e-6 for small pictures and 8.7e-6 for 3 MP on a busy machine; FLIP takes 2.2e-6 of it."""
 _EVALUATE_CPU_SECONDS_PER_VIEW = 0.35
 """For what does not shrink with the picture: 125 views of 320 x 240 pixels took 73 s."""
 _RENDER_CPU_SECONDS_PER_PIXEL = 1.5e-6
