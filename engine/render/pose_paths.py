@@ -11,8 +11,6 @@ from jaxtyping import Float64
 
 from octasplat.engine.core.errors import ConfigError
 
-_LEAST_EIGENVALUE = 1e-5
-"""Of the mean of I - d d^T over viewing directions d; it vanishes where all are parallel."""
 _WRAPPED_KEYS = 3
 """How many keys of a closed path are repeated before and after it, so that its ends join smoothly."""
 
@@ -138,10 +136,14 @@ def fit_turntable(
     if len(forwards) < 2 or not np.linalg.norm(up) > 1e-3 * len(forwards):
         raise ConfigError("These cameras share no up direction; give the turntable's centre and up yourself.")
     up = up / np.linalg.norm(up)
-    if centre_if_parallel is not None and _are_parallel(forwards):
+    centre = _nearest_to_axes(camera_centres, forwards)
+    if centre is None and centre_if_parallel is not None:
         centre = centre_if_parallel()
-    else:
-        centre = _nearest_to_axes(camera_centres, forwards)
+    if centre is None:
+        raise ConfigError(
+            "The cameras all look the same way, so that they have no common centre; "
+            "give the turntable's centre yourself."
+        )
     offsets = camera_centres - centre
     heights = offsets @ up
     across = offsets - heights[:, None] * up
@@ -238,33 +240,23 @@ def _catmull_rom_velocities(
     return np.concatenate([2 * slopes[:1] - inner[:1], inner, 2 * slopes[-1:] - inner[-1:]])
 
 
-def _are_parallel(forwards: Float64[np.ndarray, "n 3"]) -> bool:
-    """Return whether no point is determined as the one nearest to all axes."""
-    return bool(np.linalg.eigvalsh(_across(forwards).mean(axis=0))[0] < _LEAST_EIGENVALUE)
-
-
-def _across(forwards: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3 3"]:
-    """Return I - d d^T for each direction d, which maps to the part across it."""
-    projections: Float64[np.ndarray, "n 3 3"] = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]
-    return projections
-
-
 def _nearest_to_axes(
     centres: Float64[np.ndarray, "n 3"], forwards: Float64[np.ndarray, "n 3"]
-) -> Float64[np.ndarray, "3"]:
-    """Return the point with the least sum of distances to lines, by reweighted least squares."""
-    across = _across(forwards)  # distance vectors to the line
+) -> Float64[np.ndarray, "3"] | None:
+    """Return the point with the least sum of distances to lines, by reweighted least squares.
+
+    None where all lines are parallel.
+    """
+    # I - d d^T: distance vectors to the line
+    across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]
     projected = np.einsum("nij,nj->ni", across, centres)
     extent = float(np.linalg.norm(np.ptp(centres, axis=0)))
     weights = np.ones(len(centres))
     point = np.zeros(3)
     for _ in range(30):
         matrix = np.einsum("n,nij->ij", weights, across) / weights.sum()
-        if np.linalg.eigvalsh(matrix)[0] < _LEAST_EIGENVALUE:
-            raise ConfigError(
-                "The cameras all look the same way, so that they have no common centre; "
-                "give the turntable's centre yourself."
-            )
+        if np.linalg.eigvalsh(matrix)[0] < 1e-5:  # all axes parallel: the smallest eigenvalue vanishes
+            return None
         before = point
         point = np.linalg.solve(matrix, (weights @ projected) / weights.sum())
         if np.linalg.norm(point - before) < 1e-9 * max(extent, 1e-12):
