@@ -122,11 +122,15 @@ def build_gaussian_layers(
         some.build(merged.select(chosen))
         return some
 
+    boxes = bounding_boxes(merged, settings.q)
     casting, casting_on_meshes = np.concatenate(on_gaussians), np.concatenate(on_meshes)
     return GaussianLayers(
         tracer=tracer,
         boxes=GaussianBoxes(
-            bounding_boxes(merged, settings.q), bounding_boxes(merged.select(casting_on_meshes), settings.q)
+            boxes,
+            boxes
+            if casting_on_meshes.all()
+            else bounding_boxes(merged.select(casting_on_meshes), settings.q),
         ),
         min_transmittance=settings.transmittance_min,
         mesh_shadow_tracer=caster(casting_on_meshes),
