@@ -5,6 +5,7 @@ its end means that nobody waits any more. Events go to stdout, one JSON object a
 ``error``.
 """
 
+import fcntl
 import json
 import os
 import signal
@@ -12,7 +13,7 @@ import sys
 import threading
 from typing import NoReturn
 
-from octasplat.engine.core.errors import DatasetError
+from octasplat.engine.core.errors import DatasetError, DiskFullError
 from octasplat.engine.core.events import Event
 from octasplat.engine.poses.config import FOUND_FOLDER, PoseSearchRequest
 
@@ -26,6 +27,7 @@ def main() -> NoReturn:
     out = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # whatever libraries print goes to stderr
     request = PoseSearchRequest.model_validate_json(sys.stdin.readline())
+    _end_on_stdin_close()
     threading.Thread(target=_exit_on_stdin_close, daemon=True).start()
 
     def write(line: dict[str, object]) -> None:
@@ -52,7 +54,7 @@ def main() -> NoReturn:
             )
             search.run(request.work / FOUND_FOLDER)
         write({"kind": "done"})
-    except DatasetError as error:
+    except (DatasetError, DiskFullError) as error:
         write({"kind": "error", "message": str(error)})
     except (RuntimeError, ValueError, OSError, MemoryError) as error:  # COLMAP's, by way of its binding
         text = " ".join(str(error).split())[:300].rstrip(".") or type(error).__name__
@@ -64,7 +66,15 @@ def main() -> NoReturn:
     os._exit(0)
 
 
+def _end_on_stdin_close() -> None:
+    """Let the system end this process when nobody waits any more, while COLMAP holds the GIL, too."""
+    signal.signal(signal.SIGIO, signal.SIG_DFL)
+    fcntl.fcntl(0, fcntl.F_SETOWN, os.getpid())
+    fcntl.fcntl(0, fcntl.F_SETFL, fcntl.fcntl(0, fcntl.F_GETFL) | os.O_ASYNC)
+
+
 def _exit_on_stdin_close() -> None:
+    """End this process when its stdin is closed; it may have been before the system was asked to do so."""
     for _line in sys.stdin:
         pass
     os._exit(70)

@@ -4,7 +4,6 @@ Bundle adjustment adds up in the order in which its threads come, so more of the
 now and then other photographs; most of the mapper runs on one thread anyway.
 """
 
-import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from typing import Any
 import pycolmap
 
 from octasplat.engine.core.scene_layout import MIN_PHOTOGRAPHS
+from octasplat.engine.poses.stored_mappings import StoredMapping
 
 OnCount = Callable[[int], None]
 
@@ -23,19 +23,25 @@ _LARGE_ADJUSTMENT_STEPS = 20
 """Iterations of each, instead of 50."""
 _LARGE_TOLERANCE = 1e-5
 """Relative fall of the cost at which one ends."""
+_MIN_SEGMENT = 250
+"""Photographs of the first segment at least ..."""
+_SEGMENT_GROWTH = 1.2
+"""... and by which a model grows in any further one."""
 _WEAK_INLIERS = 15
 """Matches by which a photograph can be placed where the usual 30 leave some out."""
 _WEAK_INITIAL_INLIERS = 50
 """The same for the first two."""
 
 
+class _SegmentEndError(Exception):
+    """Leaves COLMAP's mapper where a segment ends."""
+
+
 def map_photographs(
     database: Path,
-    photographs: Path,
     *,
     seed: int,
     on_count: OnCount,
-    is_large: bool = False,
     allow_weak_links: bool = False,
     start: Path | None = None,
 ) -> list[Any]:
@@ -45,16 +51,75 @@ def map_photographs(
 
     Args:
         database: with matches.
-        photographs: folder.
         seed: of everything random.
         on_count: hears of photographs of the largest model so far.
-        is_large: adjust all photographs less often and with fewer steps.
         allow_weak_links: place photographs by fewer matches, too.
         start: folder of a model to go on from.
 
     Returns:
         Each a ``pycolmap.Reconstruction``; none where nothing fits together.
     """
+    manager = pycolmap.ReconstructionManager()
+    if start is not None:
+        manager.read(start)
+    _run_mapper(_options(seed, allow_weak_links), database, manager, _Count(on_count))
+    return sorted(_all_models(manager), key=model_rank, reverse=True)
+
+
+def map_in_segments(
+    database: Path,
+    stored: StoredMapping,
+    *,
+    seed: int,
+    on_count: OnCount,
+    allow_weak_links: bool = False,
+    start: Path | None = None,
+) -> list[Any]:
+    """Reconstruct a large capture as :func:`map_photographs` does, with less effort for each photograph.
+
+    All photographs are adjusted less often and with fewer steps. Now and then, after such an adjustment, the
+    model is written and mapping goes on from its files, also where it is not stopped: so a search that was
+    stopped gives the same bytes.
+
+    Args:
+        database: with matches.
+        stored: state of this mapping, from which it goes on.
+        seed: of everything random.
+        on_count: hears of photographs of the largest model so far.
+        allow_weak_links: place photographs by fewer matches, too.
+        start: folder of a model to go on from.
+
+    Returns:
+        Each a ``pycolmap.Reconstruction``; none where nothing fits together.
+    """
+    options = _options(seed, allow_weak_links)
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = _LARGE_GROWTH
+    options.ba_global_max_refinements = _LARGE_REFINEMENTS
+    options.ba_global_max_num_iterations = _LARGE_ADJUSTMENT_STEPS
+    options.ba_global_function_tolerance = options.ba_local_function_tolerance = _LARGE_TOLERANCE
+    count = _Count(on_count)
+    while not stored.state.is_done:
+        _map_segment(options, database, stored, start, count)
+    return sorted(stored.models(), key=model_rank, reverse=True)
+
+
+def _map_segment(
+    options: Any, database: Path, stored: StoredMapping, start: Path | None, count: "_Count"
+) -> None:
+    """Map until a segment ends or there is no more to map, and write the state."""
+    manager = pycolmap.ReconstructionManager()
+    if (begun := stored.state.current or start) is not None:
+        manager.read(begun)
+    options.image_names = _names_left(database, stored.models(), _all_models(manager))
+    is_segment_end = _run_mapper(options, database, manager, count, ends_segments=True)
+    models = _all_models(manager)
+    if is_segment_end:
+        stored.write(models[:-1], models[-1], is_done=False)
+    else:
+        stored.write(models, None, is_done=True)
+
+
+def _options(seed: int, allow_weak_links: bool) -> Any:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = 1
     options.random_seed = seed
@@ -66,42 +131,100 @@ def map_photographs(
     # minutes for each photograph that matches falsely, as all do of another place.
     options.structure_less_registration_fallback = False
     options.extract_colors = False  # extracted once, for the model that is kept
-    if is_large:
-        options.ba_global_frames_ratio = options.ba_global_points_ratio = _LARGE_GROWTH
-        options.ba_global_max_refinements = _LARGE_REFINEMENTS
-        options.ba_global_max_num_iterations = _LARGE_ADJUSTMENT_STEPS
-        options.ba_global_function_tolerance = options.ba_local_function_tolerance = _LARGE_TOLERANCE
     if allow_weak_links:
         options.mapper.abs_pose_min_num_inliers = _WEAK_INLIERS
         options.mapper.init_min_num_inliers = _WEAK_INITIAL_INLIERS
-    placed = len(pycolmap.Reconstruction(start).reg_image_ids()) if start is not None else 0
-    most = placed
+    return options
+
+
+def _run_mapper(
+    options: Any, database: Path, manager: Any, count: "_Count", *, ends_segments: bool = False
+) -> bool:
+    """Run COLMAP's mapper, with a model in ``manager`` to go on from or without; return where it ends.
+
+    Args:
+        options: of the mapper.
+        database: with matches.
+        manager: gets the models.
+        count: counts the photographs.
+        ends_segments: stop after an adjustment of all photographs of a model that has grown by
+            :data:`_SEGMENT_GROWTH`.
+
+    Returns:
+        Whether that was the end of a segment; the last model is not complete then.
+    """
+    pycolmap.set_random_seed(options.random_seed)
+    with pycolmap.Database.open(database) as source:
+        pipeline = pycolmap.IncrementalPipeline(options, source, manager)
+    begun = manager.get(0).num_reg_frames() if manager.size() else 0
+    adjusted = (begun, manager.get(0).num_points3D()) if begun else (0, 0)
+    segment_end = max(_SEGMENT_GROWTH * begun, _MIN_SEGMENT)
+    count.begin(begun)
 
     def first_pair() -> None:
-        nonlocal placed
-        placed = 2  # a new model begins: its photographs are counted anew
+        nonlocal adjusted
+        model = manager.get(manager.size() - 1)
+        adjusted = model.num_reg_frames(), model.num_points3D()
+        count.begin(adjusted[0])  # a new model: its photographs are counted anew
 
     def another() -> None:
-        nonlocal placed, most
-        placed += 1
-        if placed > most:
-            most = placed
-            on_count(most)  # a smaller model is no progress
+        nonlocal adjusted
+        count.add()
+        if not ends_segments:
+            return
+        model = manager.get(manager.size() - 1)
+        # as the mapper has just decided
+        if pipeline.check_run_global_refinement(model, *adjusted):
+            adjusted = model.num_reg_frames(), model.num_points3D()
+            if adjusted[0] >= segment_end:
+                raise _SegmentEndError
 
-    folder = database.with_name("models")
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir()
-    pycolmap.set_random_seed(seed)
-    models: dict[int, Any] = pycolmap.incremental_mapping(
-        database,
-        photographs,
-        folder,
-        options=options,
-        input_path=start or "",
-        initial_image_pair_callback=first_pair,
-        next_image_callback=another,
-    )
-    return sorted(models.values(), key=model_rank, reverse=True)
+    callbacks = pycolmap.IncrementalPipelineCallback
+    pipeline.add_callback(callbacks.INITIAL_IMAGE_PAIR_REG_CALLBACK.value, first_pair)
+    pipeline.add_callback(callbacks.NEXT_IMAGE_REG_CALLBACK.value, another)
+    try:
+        pipeline.run()
+    except _SegmentEndError:
+        return True
+    return False
+
+
+class _Count:
+    """Counts the photographs of a model that grows; tells of those of the largest so far."""
+
+    def __init__(self, on_count: OnCount) -> None:
+        self._on_count = on_count
+        self._placed = self._most = 0
+
+    def begin(self, placed: int) -> None:
+        """Count from here on; a smaller model is no progress."""
+        self._placed = placed
+        self._most = max(self._most, placed)
+
+    def add(self) -> None:
+        """Count one photograph."""
+        self._placed += 1
+        if self._placed > self._most:
+            self._most = self._placed
+            self._on_count(self._most)
+
+
+def _all_models(manager: Any) -> list[Any]:
+    return [manager.get(k) for k in range(manager.size())]
+
+
+def _names_left(database: Path, finished: Sequence[Any], current: Sequence[Any]) -> list[str]:
+    """Return the names of the photographs that no finished model has, and of those of the current one.
+
+    Empty, which COLMAP takes for all of them, where no model is finished.
+    """
+    if not finished:
+        return []
+    with pycolmap.Database.open(database) as source:
+        names = {image.image_id: image.name for image in source.read_all_images()}
+    placed = {number for model in finished for number in model.reg_image_ids()}
+    kept = {number for model in current for number in model.reg_image_ids()}
+    return sorted(name for number, name in names.items() if number not in placed or number in kept)
 
 
 def model_rank(model: Any) -> tuple[int, int]:

@@ -1,14 +1,16 @@
 """The search for poses, from photographs to a model that can be trusted; runs in a process of its own."""
 
 import shutil
+import sqlite3
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pycolmap
 
 from octasplat.engine.core.errors import DatasetError
-from octasplat.engine.core.events import EventListener, PhaseProgress, Warned
+from octasplat.engine.core.events import CheckpointWritten, EventListener, PhaseProgress, Warned
 from octasplat.engine.core.progress import phase
 from octasplat.engine.core.scene_layout import MIN_PHOTOGRAPHS
 from octasplat.engine.core.writing import write_json
@@ -23,7 +25,6 @@ from octasplat.engine.poses.config import (
 )
 from octasplat.engine.poses.disambiguation import (
     MappedModels,
-    describe_gps_contradictions,
     disambiguate,
     leave_out_pairs_before_mapping,
     register_without_pairs_against_gps,
@@ -38,21 +39,31 @@ from octasplat.engine.poses.features import (
 )
 from octasplat.engine.poses.found_models import write_other_models
 from octasplat.engine.poses.gps_contradictions import GroundPositions, read_ground_positions
-from octasplat.engine.poses.incremental_mapping import best_rank, map_photographs, model_rank
+from octasplat.engine.poses.incremental_mapping import (
+    best_rank,
+    map_in_segments,
+    map_photographs,
+)
 from octasplat.engine.poses.linking_pairs import NEIGHBORS_BY_NAME, propose_links
 from octasplat.engine.poses.model_selection import (
-    describe_parts,
     distinct_models,
-    is_trustworthy,
     model_facts,
 )
 from octasplat.engine.poses.pairs import Pair, all_pairs, pair_count, pairs_with
 from octasplat.engine.poses.photograph_check import check_photographs_decode, read_image_infos
+from octasplat.engine.poses.search_check import check_mapped, search_rank
+from octasplat.engine.poses.stored_mappings import (
+    MAPPINGS_FOLDER,
+    StoredMapping,
+    adopt_stored_mappings,
+    store_mappings,
+)
 from octasplat.engine.poses.stored_search import (
     DATABASE,
     SearchKeeper,
     adopt_stored_database,
     read_pairs,
+    store_database,
     write_pairs,
 )
 from octasplat.engine.poses.workspace import link_photographs, progress_stage
@@ -92,6 +103,8 @@ class PoseSearch:
         self._threads = threads or -1
         self._progress = progress
         adopt_stored_database(work)
+        adopt_stored_mappings(work)
+        self._mappings = 0
         self._photographs = work / "photographs"
         self._aliases = link_photographs(images, self._names, self._photographs, progress)
         pycolmap.logging.minloglevel = 2  # its warnings are of use to nobody here
@@ -119,10 +132,14 @@ class PoseSearch:
                 )
             )
             # max keeps the first of equals: the usual search
-            mapped = max(mapped, self._search(thorough=True), key=self._search_rank)
+            mapped = max(
+                mapped,
+                self._search(thorough=True),
+                key=lambda each: search_rank(each, count, config.min_share),
+            )
         models = mapped.models
-        self._check_models(mapped)
         names = dict(zip(self._aliases, self._names, strict=True))
+        check_mapped(mapped, names, config.min_share, self._progress)
         found.mkdir(exist_ok=True)
         for number, model in enumerate(distinct_models(models)):
             # One after the other: colors are sums.
@@ -283,15 +300,27 @@ class PoseSearch:
         allow_weak_links: bool = False,
         start: Path | None = None,
     ) -> list[Any]:
-        return map_photographs(
+        seed = self._config.seed
+        if not self._config.is_large(len(self._names)):
+            return map_photographs(
+                database, seed=seed, on_count=at, allow_weak_links=allow_weak_links, start=start
+            )
+        # A search that goes on maps the same matches in the same order.
+        folder = self._work / MAPPINGS_FOLDER / str(self._mappings)
+        self._mappings += 1
+        return map_in_segments(
             database,
-            self._photographs,
-            seed=self._config.seed,
+            StoredMapping(folder, self._tell_stored_mapping),
+            seed=seed,
             on_count=at,
-            is_large=self._config.is_large(len(self._names)),
             allow_weak_links=allow_weak_links,
             start=start,
         )
+
+    def _tell_stored_mapping(self, placed: int) -> None:
+        with suppress(OSError, sqlite3.Error):  # for other hosts; the states themselves are in the folder
+            store_database(self._work)
+            self._progress(CheckpointWritten(placed, str(store_mappings(self._work))))
 
     def _drop_unreadable(self) -> None:
         """Leave out photographs that COLMAP does not read, and warn of all that nobody could read.
@@ -367,39 +396,4 @@ class PoseSearch:
                     f"The photographs are {longest} px long at most; poses found from such small ones may be "
                     "wrong, so give them at full size."
                 )
-            )
-
-    def _search_rank(self, mapped: MappedModels) -> tuple[bool, int, int]:
-        """Return the sort key of searches: models that GPS contradicts come last, then as models do."""
-        is_enough = mapped.placed(len(self._names)) >= self._config.min_share * len(self._names)
-        return is_enough and mapped.gps_error_m is None, *best_rank(mapped.models)
-
-    def _check_models(self, mapped: MappedModels) -> None:
-        """Refuse a result that would only waste the training."""
-        count, config, models = len(self._names), self._config, mapped.models
-        if not models:
-            raise DatasetError(
-                "No poses were found: the photographs do not overlap enough, or are blurred or plain; "
-                "take more of them from nearby places, or send a COLMAP model."
-            )
-        posed, points = model_rank(models[0])
-        names = dict(zip(self._aliases, self._names, strict=True))
-        advice = (
-            "take more photographs with more overlap, of things that stand still, or send a COLMAP model."
-        )
-        if mapped.placed(count) < max(MIN_PHOTOGRAPHS, config.min_share * count):
-            raise DatasetError(
-                f"Only {posed} of {count} photographs could be placed{describe_parts(models, names)}; "
-                f"{advice}"
-            )
-        error_px = float(models[0].compute_mean_reprojection_error())
-        if not is_trustworthy(models[0]):
-            raise DatasetError(
-                f"The poses are not to be trusted ({points} points, {error_px:.1f} px mean error); {advice}"
-            )
-        for sentence in describe_gps_contradictions(mapped):
-            self._progress(Warned(sentence))
-        if posed < count:
-            self._progress(
-                Warned(f"{count - posed} of {count} photographs could not be placed and are left out.")
             )

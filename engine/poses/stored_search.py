@@ -22,8 +22,10 @@ from octasplat.engine.poses.pairs import Pair
 DATABASE = "database.db"
 """Of the first search, in the folder for the work."""
 STORED_DATABASE, SEARCH_FILE, PAIRS_FILE = "stored.db", "search.json", "pairs.json"
-STORED_SEARCH_FILES = (SEARCH_FILE, PAIRS_FILE, STORED_DATABASE)
-"""What is to be stored; the database says how far the search is, and pairs are there after the quick look."""
+STORED_MAPPINGS = "mappings.tar"
+STORED_SEARCH_FILES = (SEARCH_FILE, PAIRS_FILE, STORED_DATABASE, STORED_MAPPINGS)
+"""What is to be stored; the database says how far the search is, pairs are there after the quick look, and
+mappings are those of a large capture, see :mod:`octasplat.engine.poses.stored_mappings`."""
 STORED_FROM = 100
 """Photographs from which on the state is kept: the search for fewer is soon done again."""
 _STORE_SECONDS = 600.0
@@ -76,6 +78,12 @@ def adopt_stored_database(work: Path) -> None:
         stored.unlink(missing_ok=True)  # it may be the same file, which is written again
     elif stored.exists():
         stored.rename(work / DATABASE)
+
+
+def store_database(work: Path) -> None:
+    """Keep the database of a search that maps, if an attempt that goes on has not done so."""
+    if not (work / STORED_DATABASE).exists():
+        _link(work / DATABASE)
 
 
 def store_stopped_search(work: Path) -> Path | None:

@@ -12,6 +12,7 @@ import pytest
 from octasplat.workers.db.live_scenes import LiveScene
 from octasplat.workers.db.quotas import QuotaExceededError
 from octasplat.workers.storage.errors import StorageError
+from octasplat.workers.storage.trees import TreeFile
 from octasplat.workers.worker import reporter
 from octasplat.workers.worker.checkpoint import Checkpoint
 from octasplat.workers.worker.reporter import Reporter
@@ -192,7 +193,8 @@ async def test_reporter_says_that_the_state_at_the_end_was_not_stored(
         storage = None
 
         def store_checkpoint(self, stage: str, step: int) -> Checkpoint:
-            return Checkpoint(1, stage, step, ())
+            database = TreeFile(path="run/.poses.work/stored.db", sha256="0" * 64, size_bytes=8)
+            return Checkpoint(1, stage, step, (database,))
 
     @contextlib.asynccontextmanager
     async def no_lease(*_: object) -> AsyncIterator[None]:

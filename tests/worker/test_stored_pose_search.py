@@ -9,13 +9,14 @@ from uuid import uuid4
 import pytest
 
 from octasplat.engine.pipeline.block_request import BlockRequest, keep_request
-from octasplat.engine.poses.stored_search import STORED_DATABASE, STORED_SEARCH_FILES
+from octasplat.engine.poses.stored_search import STORED_DATABASE, STORED_MAPPINGS, STORED_SEARCH_FILES
 from octasplat.workers.db.rows import Job
 from octasplat.workers.storage.local import LocalStorage
 from octasplat.workers.worker.checkpoint import Checkpoint
 from octasplat.workers.worker.workspace import Workspace
 
 SEARCH = "run/.poses.work"
+BEFORE_MAPPING = tuple(name for name in STORED_SEARCH_FILES if name != STORED_MAPPINGS)
 
 
 def make_job(attempt: int) -> Job:
@@ -37,13 +38,13 @@ def test_state_of_a_search_is_restored_until_poses_are_there(tmp_path: Path) -> 
     (work / "pairs.json").write_text("[]")
     stored = first.store_checkpoint("features", 100)
     assert stored is not None and {file.path for file in stored.files} == {
-        f"{SEARCH}/{name}" for name in STORED_SEARCH_FILES
+        f"{SEARCH}/{name}" for name in BEFORE_MAPPING
     }
     second = Workspace(tmp_path / "work", make_job(2), storage)
     second.open()
     second.restore(Checkpoint.from_row(stored.as_row()))
     there = second.folder / SEARCH
-    assert {path.name for path in there.iterdir()} == set(STORED_SEARCH_FILES)
+    assert {path.name for path in there.iterdir()} == set(BEFORE_MAPPING)
     assert (there / STORED_DATABASE).read_bytes() == b"features"
     with (there / STORED_DATABASE).open("ab") as file:  # it is gone on with, and the stored one stays
         file.write(b" and matches")
@@ -74,7 +75,7 @@ def test_state_of_a_search_for_blocks_is_stored(tmp_path: Path) -> None:
     workspace.close()
 
 
-@pytest.mark.parametrize("files", [STORED_SEARCH_FILES, ("search.json", "pairs.json")])
+@pytest.mark.parametrize("files", [BEFORE_MAPPING, ("search.json", "pairs.json")])
 def test_search_that_is_done_twice_keeps_its_state_until_poses_are_there(
     tmp_path: Path, files: tuple[str, ...]
 ) -> None:
@@ -86,6 +87,22 @@ def test_search_that_is_done_twice_keeps_its_state_until_poses_are_there(
     for name in files:  # an attempt that goes on has made the stored database its own
         (work / name).write_text("{}")
     assert workspace.store_checkpoint("poses", 0) is None
+    workspace.close()
+
+
+def test_state_of_a_mapping_is_stored_with_what_was_matched(tmp_path: Path) -> None:
+    workspace = Workspace(tmp_path / "work", make_job(1), LocalStorage(tmp_path / "store", floor_bytes=0))
+    workspace.open()
+    work = workspace.folder / SEARCH
+    work.mkdir(parents=True)
+    for name in STORED_SEARCH_FILES:
+        (work / name).write_text("{}")
+    stored = workspace.store_checkpoint("poses", 307)
+    assert stored is not None and stored.is_of_pose_search
+    assert {file.path for file in stored.files} == {f"{SEARCH}/{name}" for name in STORED_SEARCH_FILES}
+    assert stored.is_after(Checkpoint(1, "matches", 2000, ())) and not stored.is_after(
+        Checkpoint(1, "poses", 2000, ())  # as many photographs as the found poses are of
+    )
     workspace.close()
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from octasplat.engine.core import versions
+from octasplat.engine.poses.stored_search import STORED_DATABASE
 from octasplat.workers.storage.trees import TreeFile
 
 _PLAN_FILES = ("run/blocks/plan.npz", "run/blocks/coarse/best.npz")
@@ -45,6 +46,11 @@ class Checkpoint:
         """Return the checkpoint of JSON values."""
         files = tuple(TreeFile.model_validate(file) for file in row["files"])
         return cls(row["attempt"], row["stage"], row["step"], files, row.get("results", 1))
+
+    @property
+    def is_of_pose_search(self) -> bool:
+        """Return whether it is the state of a search for poses."""
+        return any(file.path.endswith(f"/{STORED_DATABASE}") for file in self.files)
 
     @property
     def size_bytes(self) -> int:

@@ -45,7 +45,6 @@ PROGRESS_LINE_SECONDS = 30.0
 """How often the log says how far the job is."""
 _MAX_PENDING_LINES = 2_000
 _MAX_PENDING_EVENTS = 1_000
-_STAGES_OF_POSE_SEARCH = ("features", "matches")
 _STORED_EVENT_KINDS = ("stage_started", "stage_finished", "held_out_measured", "warning", "run_finished")
 _IGNORED_ERRORS = (psycopg.Error, PoolTimeout, TimeoutError, OSError)
 
@@ -158,7 +157,7 @@ class Reporter:
                 self._events.append(("progress", self._progress.pop("event")))
             self._keeps_progress = self._keeps_progress and event["stage"] != "train"
             if event["stage"] in ("poses", "placing", "lenses", "train"):
-                self._want_checkpoint(self._steps if event["stage"] == "train" else 0)
+                self._want_checkpoint(self._steps if event["stage"] in ("poses", "train") else 0)
         elif kind == BlocksPlanned.kind:
             self.blocks_planned = read_planned_blocks(event)
         elif kind == "preview_written":
@@ -307,7 +306,7 @@ class Reporter:
             try:
                 await self._attempt.record_checkpoint(checkpoint.as_row(), is_progress=advances, lease=note)
             except QuotaExceededError as error:
-                if stage in _STAGES_OF_POSE_SEARCH:  # which is much larger than what comes of it
+                if checkpoint.is_of_pose_search:  # which is much larger than what comes of it
                     self.add_note(f"Warning: the state of the search for poses is not kept: {error}")
                     return
                 # No more of them, as each would lie in the store for a while although nothing names it.

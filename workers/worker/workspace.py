@@ -12,7 +12,12 @@ from pathlib import Path
 from typing import IO
 
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.poses.stored_search import STORED_DATABASE, STORED_SEARCH_FILES, search_folder
+from octasplat.engine.poses.stored_search import (
+    STORED_DATABASE,
+    STORED_MAPPINGS,
+    STORED_SEARCH_FILES,
+    search_folder,
+)
 from octasplat.workers.db.rows import Artifact, DatasetFile, Job
 from octasplat.workers.queue.job_results import ResultFile
 from octasplat.workers.sandbox.job_users import JobUser, give_folder, open_for_reading, take_user
@@ -358,7 +363,8 @@ class Workspace:
             return [*names, newest]
         if search and not poses:
             # The first of two searches may have ended, whose state an earlier checkpoint has.
-            has_state = stage != "poses" and any(name.endswith(STORED_DATABASE) for name in search)
+            is_new = stage != "poses" or any(name.endswith(STORED_MAPPINGS) for name in search)
+            has_state = is_new and any(name.endswith(STORED_DATABASE) for name in search)
             return [*names, *search] if has_state else []
         return names if poses or pieces else []
 

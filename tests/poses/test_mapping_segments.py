@@ -1,0 +1,158 @@
+"""Mapping in segments: the same models, also where a search was stopped between two of them."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import pytest
+
+from octasplat.engine.poses import incremental_mapping
+from octasplat.engine.poses.incremental_mapping import map_in_segments, map_photographs
+from octasplat.engine.poses.stored_mappings import (
+    MAPPINGS_FOLDER,
+    StoredMapping,
+    adopt_stored_mappings,
+    store_mappings,
+)
+from octasplat.engine.poses.stored_search import STORED_MAPPINGS
+
+PHOTOGRAPHS = 24
+
+
+class KilledError(Exception):
+    """The process is killed once a state is written."""
+
+
+@pytest.fixture(scope="module")
+def two_places(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a database of photographs of one place, and of half as many of another one."""
+    path = tmp_path_factory.mktemp("matches") / "database.db"
+    pycolmap.set_random_seed(1)
+    with pycolmap.Database.open(path) as database:
+        for count in (PHOTOGRAPHS, PHOTOGRAPHS // 2):
+            options = pycolmap.SyntheticDatasetOptions()
+            options.num_rigs = options.num_cameras_per_rig = 1
+            options.num_frames_per_rig = count
+            options.num_points3D = 300
+            pycolmap.synthesize_dataset(options, database)
+    return path
+
+
+@pytest.fixture(autouse=True)
+def short_segments(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(incremental_mapping, "_MIN_SEGMENT", 8)
+
+
+def ignore_count(_count: int) -> None:
+    """Count nothing."""
+
+
+def mapped(database: Path, folder: Path, **options: Any) -> list[Any]:
+    return map_in_segments(
+        database, StoredMapping(folder, ignore_count), seed=0, on_count=ignore_count, **options
+    )
+
+
+def model_files(models: list[Any], folder: Path) -> list[dict[str, bytes]]:
+    files = []
+    for number, model in enumerate(models):
+        written = folder / f"written_{number}"
+        written.mkdir(parents=True)
+        model.write_binary(written)
+        files.append({path.name: path.read_bytes() for path in written.iterdir()})
+    return files
+
+
+def test_one_run_gives_what_colmap_gives(two_places: Path, tmp_path: Path) -> None:
+    counted: list[int] = []
+    models = map_photographs(two_places, seed=0, on_count=counted.append)
+    assert [model.num_reg_images() for model in models] == [PHOTOGRAPHS, PHOTOGRAPHS // 2]
+    assert counted == list(range(3, PHOTOGRAPHS + 1))
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads, options.random_seed = 1, 0
+    options.mapper.random_seed = options.triangulation.random_seed = 0
+    options.structure_less_registration_fallback = options.extract_colors = False
+    options.min_model_size = 3
+    pycolmap.set_random_seed(0)
+    (tmp_path / "models").mkdir()
+    expected = pycolmap.incremental_mapping(two_places, tmp_path, tmp_path / "models", options)
+    largest_first = sorted(expected.values(), key=lambda model: -model.num_reg_images())
+    assert model_files(models, tmp_path / "one") == model_files(largest_first, tmp_path / "colmap")
+
+
+def test_segments_give_the_models_of_one_run(two_places: Path, tmp_path: Path) -> None:
+    counted: list[int] = []
+    states: list[int] = []
+    models = map_in_segments(
+        two_places, StoredMapping(tmp_path, states.append), seed=0, on_count=counted.append
+    )
+    assert counted == list(range(3, PHOTOGRAPHS + 1))
+    assert len(states) >= 4 and states == sorted(states) and states[-1] == PHOTOGRAPHS
+    whole = map_photographs(two_places, seed=0, on_count=ignore_count)
+    assert [sorted(model.reg_image_ids()) for model in models] == [
+        sorted(model.reg_image_ids()) for model in whole
+    ]
+    for model, other in zip(models, whole, strict=True):
+        found = pycolmap.align_reconstructions_via_reprojections(model, other)
+        numbers = sorted(model.reg_image_ids())
+        centres, expected = (
+            np.array([each.images[number].projection_center() for number in numbers])
+            for each in (model, other)
+        )
+        moved = np.array([found * centre for centre in centres])
+        np.testing.assert_allclose(moved, expected, atol=1e-4 * np.ptp(expected))
+
+
+def test_mapping_that_was_stopped_gives_the_same_bytes(two_places: Path, tmp_path: Path) -> None:
+    at_once = model_files(mapped(two_places, tmp_path / "at_once"), tmp_path / "at_once_files")
+    work = tmp_path / "work"
+    folder = work / MAPPINGS_FOLDER / "0"
+    stops = 0
+    first_counts: list[int] = []
+
+    def kill(_placed: int) -> None:
+        raise KilledError
+
+    while True:
+        counted: list[int] = []
+        try:
+            map_in_segments(two_places, StoredMapping(folder, kill), seed=0, on_count=counted.append)
+        except KilledError:
+            stops += 1
+            first_counts += counted[:1]
+            # the next attempt is on another host
+            store_mappings(work)
+            other = tmp_path / f"other_{stops}"
+            other.mkdir()
+            shutil.copyfile(work / STORED_MAPPINGS, other / STORED_MAPPINGS)
+            adopt_stored_mappings(other)
+            work, folder = other, other / MAPPINGS_FOLDER / "0"
+            (folder / "7").mkdir(exist_ok=True)  # of a state that was not written any more
+        else:
+            break
+    assert stops >= 4 and first_counts[1] > 8  # goes on from what there is
+    assert model_files(mapped(two_places, folder), tmp_path / "files") == at_once
+
+
+def test_mapping_goes_on_from_a_model(two_places: Path, tmp_path: Path) -> None:
+    start = tmp_path / "start"
+    start.mkdir()
+    whole = map_photographs(two_places, seed=0, on_count=ignore_count)
+    whole[1].write_binary(start)
+    for models in (
+        mapped(two_places, tmp_path / "segments", start=start, allow_weak_links=True),
+        map_photographs(two_places, seed=0, on_count=ignore_count, start=start, allow_weak_links=True),
+    ):
+        assert sorted(whole[1].reg_image_ids()) in [sorted(model.reg_image_ids()) for model in models]
+
+
+def test_states_that_are_cut_short_are_not_taken(tmp_path: Path) -> None:
+    (tmp_path / STORED_MAPPINGS).write_bytes(b"cut short")
+    adopt_stored_mappings(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == [STORED_MAPPINGS]
+    folder = tmp_path / MAPPINGS_FOLDER / "0"
+    folder.mkdir(parents=True)
+    (folder / "state.json").write_text('{"finished": ["0"], "curr')
+    assert not StoredMapping(folder, ignore_count).state.is_done
