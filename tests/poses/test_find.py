@@ -26,12 +26,13 @@ from octasplat.engine.core.events import (
     Warned,
 )
 from octasplat.engine.core.writing import write_json
-from octasplat.engine.poses import stored_search
+from octasplat.engine.poses import incremental_mapping, stored_search
 from octasplat.engine.poses.find_poses import PosesConfig, find_poses
 from octasplat.engine.poses.photographs import photographs_sha256
 from octasplat.engine.poses.search import PoseSearch
 from octasplat.engine.poses.stored_search import (
     SEARCH_FILE,
+    STORED_MAPPINGS,
     STORED_SEARCH_FILES,
     search_folder,
     search_record,
@@ -283,6 +284,49 @@ def test_search_goes_on_in_another_folder_from_what_was_stored(
         assert {path.name: path.read_bytes() for path in (tmp_path / f"poses{number}").iterdir()} == {
             path.name: path.read_bytes() for path in found_at_once.model.iterdir()
         }
+
+
+class _KilledError(Exception):
+    """The process is killed."""
+
+
+@pytest.mark.exhaustive
+def test_large_capture_that_is_stopped_while_it_is_mapped_gives_the_same_bytes(
+    taken: Photographs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(incremental_mapping, "_MIN_SEGMENT", 6)
+    names, large = tuple(sorted(taken.centres_world)), PosesConfig(exhaustive_up_to=6, quick_look_up_to=10)
+
+    def search(work: Path, *, kills: bool) -> bool:
+        """Search in a folder; return whether it was killed at the first state of a mapping."""
+        work.mkdir(exist_ok=True)
+
+        def listen(event: Event) -> None:
+            if kills and isinstance(event, CheckpointWritten) and event.path.endswith(STORED_MAPPINGS):
+                raise _KilledError
+
+        try:
+            PoseSearch(taken.folder, names, work, large, 1, listen).run(work / "found")
+        except _KilledError:
+            return True
+        return False
+
+    assert not search(tmp_path / "at_once", kills=False)
+    work, kills = tmp_path / "work_0", 0
+    while search(work, kills=True):
+        kills += 1
+        other = tmp_path / f"work_{kills}"  # of another host, which gets what was stored
+        other.mkdir()
+        for name in STORED_SEARCH_FILES:
+            if (work / name).exists():
+                shutil.copyfile(work / name, other / name)
+        work = other
+    assert kills >= 3
+    once, stopped = (
+        {path.name: path.read_bytes() for path in (folder / "found").iterdir() if path.is_file()}
+        for folder in (tmp_path / "at_once", work)
+    )
+    assert once == stopped and "images.bin" in once
 
 
 @pytest.mark.exhaustive
