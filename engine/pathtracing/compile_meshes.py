@@ -384,3 +384,15 @@ def load_mesh_shape(
                 "alike), so that it cannot be glass; close it or choose another material."
             )
     return shape
+
+
+def check_glass_is_closed(stage: Stage, folder: Path) -> None:
+    """Check the meshes of files that are to be glass, relative to ``folder``.
+
+    Raises:
+        ConfigError: one is not closed.
+        SceneFileError: one cannot be read.
+    """
+    for number, mesh in enumerate(stage.meshes):
+        if isinstance(mesh.material, Glass) and mesh.file is not None:
+            load_mesh_shape(mesh, number, folder)

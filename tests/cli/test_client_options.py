@@ -55,6 +55,17 @@ def test_assignments_win_over_the_files_of_a_stage_and_a_path(tmp_path) -> None:
     assert options["camera_path"]["fps"] == 7 and options["camera_path"]["width"] == 32
 
 
+def test_open_glass_is_refused_before_it_is_sent(tmp_path, octasplat, asked: list[dict]) -> None:
+    stage = tmp_path / "stage.toml"
+    stage.write_text("[[meshes]]\nfile = 'leaf.obj'\nmaterial = { kind = 'glass' }\n")
+    (tmp_path / "leaf.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    done = octasplat("derive", "render", JOB["id"], "--stage", str(stage))
+    assert done.exit_code != 0 and "leaf.obj is not closed (3 edges" in done.stderr and not asked
+    tetrahedron = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    (tmp_path / "leaf.obj").write_text(tetrahedron)
+    assert list(with_stage(Derivation(JOB["id"], "render"), stage).files) == ["leaf.obj"]
+
+
 def test_submit_names_the_job_that_it_begins_with(octasplat, asked: list[dict]) -> None:
     done = octasplat("submit", "--start-from", JOB["id"], "--preset", "high")
     assert done.exit_code == 0, done.output

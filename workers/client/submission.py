@@ -10,6 +10,7 @@ from octasplat.engine.core.errors import ConfigError, OctasplatError
 from octasplat.engine.core.events import EventListener, Noted, Warned, ignore_events
 from octasplat.engine.core.portable_names import name_or
 from octasplat.engine.core.progress import counted_phase
+from octasplat.engine.pathtracing.stage.materials import Glass
 from octasplat.engine.pathtracing.stage.sidecar_files import sidecar_files
 from octasplat.engine.pathtracing.stage.stage_file import read_stage, referenced_files, with_renamed_files
 from octasplat.engine.render.path_document import read_path_document
@@ -110,9 +111,16 @@ def with_stage(derivation: Derivation, stage: Path) -> Derivation:
     sent under other ones.
 
     Raises:
-        ConfigError: the stage cannot be used, or a file that it names is not there.
+        ConfigError: the stage cannot be used, a file that it names is not there, or a mesh that is to be
+            glass is not closed.
+        SceneFileError: a mesh that is to be glass cannot be read.
     """
     read = read_stage(stage)
+    if any(mesh.file is not None and isinstance(mesh.material, Glass) for mesh in read.meshes):
+        # Its kernels take a second to load, which other stages do not need.
+        from octasplat.engine.pathtracing.compile_meshes import check_glass_is_closed
+
+        check_glass_is_closed(read, stage.parent)
     names: dict[str, str] = {}
     for _, name in referenced_files(read):
         names[name] = name_or(name, f"elsewhere/{len(names)}/{Path(name).name}")
