@@ -16,7 +16,7 @@ from octasplat.workers.client.dataset_files import (
     send_files,
     sha256_of,
 )
-from octasplat.workers.client.dataset_tasks import commit, create_dataset_once
+from octasplat.workers.client.dataset_tasks import create_dataset_once, fill_and_commit
 from octasplat.workers.client.resumable_upload import MIN_RESUMABLE_BYTES, send_resumable
 
 _ARCHIVE_END_BYTES = 1 << 18
@@ -146,10 +146,8 @@ def upload_scene(
         files = list_scene_files(api, scene, on_warning)
     dataset = _find_or_create_dataset(api, name or _replace_non_utf8(scene.resolve().stem), files)
     if is_archive and dataset["state"] == "open":
-        _send_archive(api, dataset["id"], files[0], progress)
-    else:
-        _send_folder(api, dataset, files, progress, on_note)
-    return commit(api, dataset)
+        return fill_and_commit(api, dataset, lambda: _send_archive(api, dataset["id"], files[0], progress))
+    return _send_folder(api, dataset, files, progress, on_note)
 
 
 def upload_files(
@@ -177,8 +175,7 @@ def upload_files(
     """
     local = [LocalFile(called, path, path.stat().st_size) for called, path in sorted(files.items())]
     dataset = _find_or_create_dataset(api, name, local, holds="files")
-    _send_folder(api, dataset, local, progress, on_note)
-    return commit(api, dataset)
+    return _send_folder(api, dataset, local, progress, on_note)
 
 
 def _find_or_create_dataset(
@@ -196,15 +193,23 @@ def _find_or_create_dataset(
 
 def _send_folder(
     api: Api,
-    dataset: Mapping[str, Any],
+    dataset: dict[str, Any],
     files: Sequence[LocalFile],
     progress: Callable[[int, int], None],
     on_note: Callable[[str], None],
-) -> None:
-    """Send the files that are lacking, and note those that are not; a dataset that is closed has them all."""
-    unsent = send_files(api, dataset["id"], files, progress) if dataset["state"] == "open" else files
-    if (sentence := describe_unsent(unsent, len(files))) is not None:
-        on_note(sentence)
+) -> dict[str, Any]:
+    """Send the files that are lacking, note those that are not, and commit the dataset; returns it.
+
+    A dataset that is closed has them all.
+    """
+
+    def note(unsent: Sequence[LocalFile]) -> None:
+        if (sentence := describe_unsent(unsent, len(files))) is not None:
+            on_note(sentence)
+
+    if dataset["state"] != "open":
+        note(files)
+    return fill_and_commit(api, dataset, lambda: note(send_files(api, dataset["id"], files, progress)))
 
 
 def _send_archive(api: Api, dataset_id: str, file: LocalFile, progress: Callable[[int, int], None]) -> None:
