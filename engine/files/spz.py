@@ -173,7 +173,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     scene = select_for_export(gaussians, path, options)
     content = encode(scene, path, options.spz_version)
     with atomic_replace(path) as temporary, temporary.open("wb") as handle:
-        write_spz(content, handle)
+        write_spz(content, handle, path.parent)
     return (path,)
 
 

@@ -293,16 +293,18 @@ def _truncated_error(path: Path, count: int) -> SceneFileError:
     return SceneFileError(f"{path}: is truncated; not all of its {count} Gaussians are there.")
 
 
-def write_spz(content: SpzContent, handle: BinaryFile) -> None:
+def write_spz(content: SpzContent, handle: BinaryFile, folder: Path | None = None) -> None:
     """Write a file, piece by piece: gzip for version 3, Zstandard for version 4.
 
     Args:
         content: what to write.
         handle: an empty file; it can be gone back in.
+        folder: for a file without a name that holds an attribute of version 4; None for that of the system,
+            which may be in memory.
     """
     header = content.header
     if header.version == VERSIONS[-1]:
-        _write_v4(content, handle)
+        _write_v4(content, handle, folder)
         return
     fields = (header.version, header.count, header.sh_degree, header.fractional_bits, header.flags, 0)
     # Without the time, equal scenes give equal files.
@@ -313,7 +315,7 @@ def write_spz(content: SpzContent, handle: BinaryFile) -> None:
                 packed.write(piece)
 
 
-def _write_v4(content: SpzContent, handle: BinaryFile) -> None:
+def _write_v4(content: SpzContent, handle: BinaryFile, folder: Path | None) -> None:
     header = content.header
     present = [stream for stream, width in zip(content.streams, header.widths, strict=True) if width]
     fields = (header.version, header.count, header.sh_degree, header.fractional_bits, header.flags)
@@ -322,7 +324,7 @@ def _write_v4(content: SpzContent, handle: BinaryFile) -> None:
     sizes = []
     for stream in present:
         # Zstandard makes other bytes of a stream in pieces, so that it is put on disk, and mapped.
-        with tempfile.TemporaryFile() as spool:
+        with tempfile.TemporaryFile(dir=folder) as spool:
             for piece in stream:
                 spool.write(piece)
             spool.flush()
