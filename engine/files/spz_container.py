@@ -204,7 +204,7 @@ class SpzSource:
         if version != VERSIONS[-1]:
             raise SceneFileError(f"{self.path}: is SPZ version {version}; versions 2, 3 and 4 are read.")
         header = self._checked_header(version, count, degree, bits, flags)
-        header = self._with_records(header, handle.read(min(contents - len(start), _MAX_EXTENSIONS)))
+        header = self._with_records(header, handle.read(min(max(contents - len(start), 0), _MAX_EXTENSIONS)))
         if stream_count < sum(width > 0 for width in header.widths):
             raise SceneFileError(f"{self.path}: is damaged; it has only {stream_count} of its attributes.")
         handle.seek(contents)
