@@ -4,7 +4,8 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-_MAX_NAMES = 5
+from octasplat.engine.core.name_lists import name_list
+from octasplat.engine.core.scene_layout import is_ignored_file
 
 
 def files_below(
@@ -35,9 +36,7 @@ def files_below(
 
 
 def unreadable_folders_sentence(folders: Sequence[Path], root: Path) -> str | None:
-    """Return what to tell of folders below ``root`` that cannot be read; None where there are none."""
-    if not folders:
-        return None
-    names = [str(folder.relative_to(root)) for folder in sorted(folders)]
-    more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
-    return f"Files in folders that cannot be read are left out ({', '.join(names[:_MAX_NAMES])}{more})."
+    """Return what to tell of folders below ``root`` that cannot be read; None for hidden ones or none."""
+    names = sorted(folder.relative_to(root).as_posix() for folder in folders)
+    told = [name for name in names if name == "." or not is_ignored_file(name)]
+    return f"Files in folders that cannot be read are left out ({name_list(told)})." if told else None

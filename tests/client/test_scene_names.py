@@ -86,13 +86,13 @@ def test_folder_that_cannot_be_read_is_told(
     serve: Callable[..., Front], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """When a scene is sent, and when it is reconstructed here."""
-    for folder in ("images/left", "images/right"):
+    for folder in ("images/left", "images/right", ".Trash"):
         (tmp_path / folder).mkdir(parents=True)
         (tmp_path / folder / "a.jpg").write_bytes(b"x")
     list_folder, warnings = Path.iterdir, list[str]()
 
     def refuse_right(folder: Path) -> Any:
-        if folder.name == "right":
+        if folder.name in ("right", ".Trash"):
             raise PermissionError(13, "Permission denied")
         return list_folder(folder)
 
