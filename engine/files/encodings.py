@@ -4,10 +4,12 @@ from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt8
+from jaxtyping import Float, Float32, Float64, Int, UInt8
 
 from octasplat.engine.gaussians.flattening import GaussianCloud
+from octasplat.engine.gaussians.frames import quaternions_from_matrices, rotation_matrices
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
+from octasplat.engine.gaussians.spherical_harmonics import rotate_sh
 
 SceneT = TypeVar("SceneT", FlatGaussians, GaussianCloud)
 SQRT_HALF = float(np.sqrt(0.5))
@@ -102,4 +104,17 @@ def half_turn_gaussians(gaussians: SceneT) -> SceneT:
         means_world=half_turn_points(gaussians.means_world),
         quats_wxyz=half_turn_quats(gaussians.quats_wxyz),
         sh=half_turn_sh(gaussians.sh),
+    )
+
+
+def turn_cloud(cloud: GaussianCloud, turn: Float64[np.ndarray, "3 3"]) -> GaussianCloud:
+    """Return Gaussians after a rotation or a reflection about the origin, harmonics included."""
+    frames = turn @ rotation_matrices(cloud.quats_wxyz.astype(np.float64))
+    if np.linalg.det(turn) < 0:
+        frames[:, :, 0] *= -1.0  # which way an axis points makes no difference to a Gaussian
+    return replace(
+        cloud,
+        means_world=(cloud.means_world.astype(np.float64) @ turn.T).astype(np.float32),
+        quats_wxyz=quaternions_from_matrices(frames).astype(np.float32),
+        sh=rotate_sh(cloud.sh, np.broadcast_to(turn, (len(frames), 3, 3))),
     )

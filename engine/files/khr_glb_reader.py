@@ -19,6 +19,7 @@ from octasplat.engine.files.encodings import (
     dropped_sh_message,
     half_turn_gaussians,
     sh0_from_rgb,
+    turn_cloud,
 )
 from octasplat.engine.files.glb_container import GlbFile
 from octasplat.engine.files.khr_glb import COMPRESSION, EXTENSION
@@ -28,10 +29,8 @@ from octasplat.engine.files.spz import decode
 from octasplat.engine.files.spz_container import SpzSource, parse_spz
 from octasplat.engine.gaussians.channels import Channels, merge_widths
 from octasplat.engine.gaussians.flattening import CloudBlocks, GaussianCloud, join_blocks, row_slices
-from octasplat.engine.gaussians.frames import quaternions_from_matrices, rotation_matrices
 from octasplat.engine.gaussians.model import SH_C0
 from octasplat.engine.gaussians.rows import RowIndex
-from octasplat.engine.gaussians.spherical_harmonics import rotate_sh
 
 SIMILARITY_TOLERANCE = 1e-4
 """Relative error up to which a node may fail to be a rotation with one scale."""
@@ -157,7 +156,7 @@ class _Splats:
         )
         if further:
             self._packed = parse_spz(path, file.view_bytes(further[COMPRESSION]["bufferView"]))
-            self.count = self._packed.header.count
+            self.count = self._packed.count
             self.coefficients = (min(self._packed.header.sh_degree, MAX_SH_DEGREE) + 1) ** 2
         else:
             self._harmonics = _harmonic_accessors(attributes)
@@ -252,17 +251,12 @@ def _apply_node_transform(
     # A map that mirrors has a negative determinant.
     if not scale > 0 or np.abs(linear @ linear.T / scale**2 - np.eye(3)).max() > SIMILARITY_TOLERANCE:
         raise SceneFileError(f"{path}: a node mirrors its splats or scales them unevenly; apply it first.")
-    rotation = linear / scale
-    frames = rotation @ rotation_matrices(cloud.quats_wxyz.astype(np.float64))
-    turns = np.broadcast_to(rotation, (len(frames), 3, 3))
     means = cloud.means_world.astype(np.float64) @ linear.T + matrix[:3, 3]
     return replace(
-        cloud,
+        turn_cloud(cloud, linear / scale),
         means_world=means.astype(np.float32),
-        quats_wxyz=quaternions_from_matrices(frames).astype(np.float32),
         log_scales=(cloud.log_scales + np.log(scale)).astype(np.float32),
         min_log_scale=cloud.min_log_scale + float(np.log(scale)),
-        sh=rotate_sh(cloud.sh, turns),
     )
 
 

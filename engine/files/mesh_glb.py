@@ -248,7 +248,8 @@ def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions)
         if not has_materials(gaussians):
             raise ConfigError(f"{path}: not written, as the scene has no materials to be lit by.")
         options, ramp = options.model_copy(update={"ids": False}), material_ramp_png()
-    soup = OctagonSoup(gaussians, path, options, OPAQUE_CUTOFF if options.opaque else None)
+    cutoff = OPAQUE_CUTOFF if options.opaque else None
+    soup = OctagonSoup(gaussians, path, options, cutoff, is_numbered=options.ids)
     png = white_with_alpha_png(options.falloff_texture_size, options.q)
     parts = _plan_files(soup, path, (len(png), len(ramp)), options)
     paths = glb_parts.part_paths(path, len(parts))

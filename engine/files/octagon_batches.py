@@ -64,21 +64,33 @@ class OctagonSoup:
     """
 
     def __init__(
-        self, gaussians: FlatGaussians, path: Path, options: ExportOptions, alpha_cutoff: float | None = None
+        self,
+        gaussians: FlatGaussians,
+        path: Path,
+        options: ExportOptions,
+        alpha_cutoff: float | None = None,
+        *,
+        is_numbered: bool = True,
     ) -> None:
-        """Pick the Gaussians to write; ``path`` only names the file in errors.
+        """Pick the Gaussians to write.
 
-        With ``alpha_cutoff`` each octagon is only as large as the ellipse in which alpha reaches that.
+        Args:
+            gaussians: the scene.
+            path: the file, only named in errors.
+            options: of the export.
+            alpha_cutoff: each octagon is only as large as the ellipse in which alpha reaches this.
+            is_numbered: whether the file has the numbers of the Gaussians, of which there are only so many.
 
         Raises:
             SceneFileError: no octagons, values that are not finite, or too many Gaussians to number.
         """
         if not gaussians.is_finite():
             raise SceneFileError(f"{path}: not written, as some Gaussians hold values that are not finite.")
-        if len(gaussians) > MAX_FLOAT_ID:
+        if is_numbered and len(gaussians) > MAX_FLOAT_ID:
             raise SceneFileError(
                 f"{path}: not written; a mesh can number {MAX_FLOAT_ID} Gaussians, and the scene has "
-                f"{len(gaussians)}. Export it in parts or as a Gaussian PLY."
+                f"{len(gaussians)}. Export it in parts, as a Gaussian PLY, or as a GLB without numbers "
+                "(--no-ids, --for-viewers)."
             )
         self.q = options.q
         self.min_opacity = options.min_opacity

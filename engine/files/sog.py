@@ -294,7 +294,12 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
         OSError: the file cannot be written.
     """
     scene = select_for_export(gaussians, path, options)
-    with tempfile.TemporaryDirectory(prefix="octasplat-") as folder, atomic_replace(path) as temporary:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # beside the file, as the folder of the system may be in memory
+    with (
+        tempfile.TemporaryDirectory(prefix="octasplat-", dir=path.parent) as folder,
+        atomic_replace(path) as temporary,
+    ):
         source, target = Path(folder) / "scene.ply", Path(folder) / "scene.sog"
         write_gaussian_ply(scene, source)
         try:

@@ -7,7 +7,7 @@ import numpy as np
 
 from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.files.export_options import ExportOptions
-from octasplat.engine.gaussians.flattening import row_slices
+from octasplat.engine.gaussians.flattening import row_slices, select_gaussians
 from octasplat.engine.gaussians.model import FlatGaussians
 
 # A little less than the largest, whose power may be rounded to infinity
@@ -15,7 +15,12 @@ MAX_LOG_SCALE = float(np.log(np.finfo(np.float32).max)) - 1e-3
 
 
 def select_for_export(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> FlatGaussians:
-    """Return the Gaussians not fainter than ``options.min_opacity``, all finite; ``path`` is for errors.
+    """Return the Gaussians not fainter than ``options.min_opacity``, all finite.
+
+    Args:
+        gaussians: the scene.
+        path: the file that is written, named in errors; many Gaussians that are left are in files beside it.
+        options: of the export.
 
     Raises:
         SceneFileError: nothing to write, or values that are not finite.
@@ -27,7 +32,7 @@ def select_for_export(gaussians: FlatGaussians, path: Path, options: ExportOptio
     if options.min_opacity > 0.0:
         count = len(gaussians)
         is_kept = [block.opacities >= options.min_opacity for block in iterate_blocks(gaussians)]
-        gaussians = gaussians.select(np.concatenate(is_kept))
+        gaussians = select_gaussians(gaussians, np.concatenate(is_kept), path.parent)
         if not len(gaussians):
             raise SceneFileError(f"{path}: not written; all {count} Gaussians are below min_opacity.")
     return gaussians

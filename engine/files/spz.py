@@ -1,5 +1,7 @@
 """SPZ (Niantic), about 15 bytes a Gaussian: versions 2, 3 and 4 in, 3, which every viewer reads, or 4 out."""
 
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +22,7 @@ from octasplat.engine.files.encodings import (
     half_turn_sh,
     logits_from_bytes,
     smallest_three,
+    turn_cloud,
 )
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.range_losses import (
@@ -39,6 +42,11 @@ from octasplat.engine.files.spz_container import (
     open_spz,
     write_spz,
 )
+from octasplat.engine.files.spz_records import (
+    RIGHT_UP_BACK,
+    right_up_back_from,
+    unread_records_message,
+)
 from octasplat.engine.gaussians.flattening import (
     FLAT_LOG_SCALE,
     CloudBlocks,
@@ -47,6 +55,7 @@ from octasplat.engine.gaussians.flattening import (
     row_slices,
 )
 from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.rows import select_rows
 
 COLOR_SCALE = 0.15
 """Constant harmonics h are written as the byte 255 (0.15 h + 0.5)."""
@@ -83,11 +92,25 @@ def decode(source: SpzSource) -> CloudBlocks:
     Raises:
         SceneFileError: there are none.
     """
-    count = source.header.count
-    if count == 0:
+    if source.count == 0:
         raise SceneFileError(f"{source.path}: holds no Gaussians.")
-    found = source.blocks(row_slices(count))
-    return CloudBlocks(count, ((rows, _decode_block(source.header, streams)) for rows, streams in found))
+    return CloudBlocks(source.count, _decoded_blocks(source))
+
+
+def _decoded_blocks(source: SpzSource) -> Iterator[tuple[slice, GaussianCloud]]:
+    """Yield the Gaussians of the finest level, y up."""
+    header, start = source.header, 0
+    for rows, streams in source.blocks(row_slices(header.count)):
+        cloud = _decode_block(header, streams)
+        if source.is_finest is not None:
+            cloud = select_rows(cloud, source.is_finest[rows])
+            note = f"It has levels of detail; the finest was read, {source.count:,} of {header.count:,}."
+            cloud = replace(cloud, notes=(*cloud.notes, note))
+        if header.frame != RIGHT_UP_BACK:
+            cloud = turn_cloud(cloud, right_up_back_from(header.frame))
+        if count := len(cloud.means_world):
+            yield slice(start, start + count), cloud
+        start += count
 
 
 def _decode_block(file: SpzHeader, streams: tuple[bytes, ...]) -> GaussianCloud:
@@ -100,7 +123,9 @@ def _decode_block(file: SpzHeader, streams: tuple[bytes, ...]) -> GaussianCloud:
     constant = (colors.astype(np.float32) / 255.0 - 0.5) / COLOR_SCALE
     sh = np.concatenate([constant[:, None, :], rest], axis=1).astype(np.float32)
     quats = _decode_xyz(rotations) if file.version == 2 else _decode_smallest_three(rotations)
-    notes = [*dropped_sh_message(file.sh_degree)]
+    if file.has_levels:
+        opacities = np.minimum(opacities.astype(np.uint16) * 2, 255).astype(np.uint8)
+    notes = [*dropped_sh_message(file.sh_degree), *unread_records_message(file.record_kinds)]
     if file.flags & ANTIALIASED:
         notes.append("The scene was trained with antialiasing, which is not modelled here.")
     return GaussianCloud(
@@ -148,7 +173,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     scene = select_for_export(gaussians, path, options)
     content = encode(scene, path, options.spz_version)
     with atomic_replace(path) as temporary, temporary.open("wb") as handle:
-        write_spz(content, handle)
+        write_spz(content, handle, path.parent)
     return (path,)
 
 

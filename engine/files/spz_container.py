@@ -12,13 +12,22 @@ import struct
 import tempfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Protocol, cast, runtime_checkable
 
+import numpy as np
 import zstandard
+from jaxtyping import Bool
 
 from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.files.spz_records import (
+    HAS_LEVELS,
+    HAS_RECORDS,
+    RIGHT_UP_BACK,
+    frame_of,
+    parse_records,
+)
 
 MAGIC = b"NGSP"
 GZIP_MAGIC = b"\x1f\x8b"
@@ -34,6 +43,8 @@ _GZIP_RATIO = 1040
 _ZSTD_RATIO = 1 << 17
 _MAX_EXTENSIONS = 1 << 24
 _SKIPPED_BYTES = 1 << 20
+_CHILD_COUNT_BYTES, _FIRST_CHILD_BYTES = 2, 4
+"""Of a Gaussian in a tree of levels: all counts come before all numbers of first children."""
 
 
 BinaryFile = IO[bytes] | io.BytesIO
@@ -49,6 +60,8 @@ class SpzHeader:
         sh_degree: 0 to 4.
         fractional_bits: of the 24-bit fixed-point positions.
         flags: bits, of which ``ANTIALIASED`` is one.
+        frame: where x, y and z point, see :mod:`octasplat.engine.files.spz_records`.
+        record_kinds: types of records of extensions.
     """
 
     version: int
@@ -56,6 +69,13 @@ class SpzHeader:
     sh_degree: int
     fractional_bits: int
     flags: int
+    frame: str = RIGHT_UP_BACK
+    record_kinds: tuple[int, ...] = ()
+
+    @property
+    def has_levels(self) -> bool:
+        """Return whether coarser Gaussians are among them, and opacities are halved, as Spark has it."""
+        return self.version != VERSIONS[-1] and bool(self.flags & HAS_LEVELS)
 
     @property
     def widths(self) -> tuple[int, ...]:
@@ -88,6 +108,7 @@ class SpzSource:
     Attributes:
         path: file that it is from, for errors.
         header: what it says of its Gaussians.
+        is_finest: which of them are not coarser ones that stand for some of the others; None where all are.
     """
 
     def __init__(self, path: Path, open_content: Callable[[], BinaryFile], size: int) -> None:
@@ -106,6 +127,7 @@ class SpzSource:
         self._size = size
         self._toc: list[tuple[int, int]] = []
         """Of version 4, where each attribute begins and its length, packed."""
+        self.is_finest: Bool[np.ndarray, " n"] | None = None
         with _name_errors(path), open_content() as handle:
             start = handle.read(len(MAGIC))
             handle.seek(0)
@@ -115,6 +137,11 @@ class SpzSource:
                 self.header = self._read_gzip_header(handle)
             else:
                 raise SceneFileError(f"{path}: is no SPZ file.")
+
+    @property
+    def count(self) -> int:
+        """Return the number of Gaussians of the finest level."""
+        return self.header.count if self.is_finest is None else int(self.is_finest.sum())
 
     def blocks(self, rows: Iterable[slice]) -> Iterator[tuple[slice, tuple[bytes, ...]]]:
         """Yield the six attributes of the rows of each slice; slices follow each other from the first row on.
@@ -156,7 +183,20 @@ class SpzSource:
         header = self._checked_header(version, count, degree, bits, flags)
         if count * sum(header.widths) > _GZIP_RATIO * self._size:
             raise _truncated_error(self.path, count)
-        return header
+        return self._read_gzip_end(handle, header) if flags & (HAS_LEVELS | HAS_RECORDS) else header
+
+    def _read_gzip_end(self, handle: BinaryFile, header: SpzHeader) -> SpzHeader:
+        """Read what follows the attributes; returns the header with what records say."""
+        handle.seek(0)
+        with gzip.open(handle) as unpacked:
+            _skip(unpacked, _HEADER.size + header.count * sum(header.widths))
+            if header.has_levels:
+                counts = unpacked.read(header.count * _CHILD_COUNT_BYTES)
+                if len(counts) < header.count * _CHILD_COUNT_BYTES:
+                    raise _truncated_error(self.path, header.count)
+                self.is_finest = np.frombuffer(counts, "<u2") == 0
+                _skip(unpacked, header.count * _FIRST_CHILD_BYTES)
+            return self._with_records(header, unpacked.read(_MAX_EXTENSIONS))
 
     def _read_contents(self, handle: BinaryFile) -> SpzHeader:
         start = handle.read(_HEADER_V4.size)
@@ -164,6 +204,7 @@ class SpzSource:
         if version != VERSIONS[-1]:
             raise SceneFileError(f"{self.path}: is SPZ version {version}; versions 2, 3 and 4 are read.")
         header = self._checked_header(version, count, degree, bits, flags)
+        header = self._with_records(header, handle.read(min(max(contents - len(start), 0), _MAX_EXTENSIONS)))
         if stream_count < sum(width > 0 for width in header.widths):
             raise SceneFileError(f"{self.path}: is damaged; it has only {stream_count} of its attributes.")
         handle.seek(contents)
@@ -186,6 +227,14 @@ class SpzSource:
         if degree > MAX_DEGREE:
             raise SceneFileError(f"{self.path}: is damaged; it claims harmonics of degree {degree}.")
         return SpzHeader(version, count, degree, bits, flags)
+
+    def _with_records(self, header: SpzHeader, data: bytes) -> SpzHeader:
+        """Return the header with what records of extensions say."""
+        records = parse_records(data) if header.flags & HAS_RECORDS else {}
+        frame = frame_of(records)
+        if frame is None:
+            raise SceneFileError(f"{self.path}: is stored in a coordinate system that is not known here.")
+        return replace(header, frame=frame, record_kinds=tuple(records))
 
 
 class _Part:
@@ -244,16 +293,18 @@ def _truncated_error(path: Path, count: int) -> SceneFileError:
     return SceneFileError(f"{path}: is truncated; not all of its {count} Gaussians are there.")
 
 
-def write_spz(content: SpzContent, handle: BinaryFile) -> None:
+def write_spz(content: SpzContent, handle: BinaryFile, folder: Path | None = None) -> None:
     """Write a file, piece by piece: gzip for version 3, Zstandard for version 4.
 
     Args:
         content: what to write.
         handle: an empty file; it can be gone back in.
+        folder: for a file without a name that holds an attribute of version 4; None for that of the system,
+            which may be in memory.
     """
     header = content.header
     if header.version == VERSIONS[-1]:
-        _write_v4(content, handle)
+        _write_v4(content, handle, folder)
         return
     fields = (header.version, header.count, header.sh_degree, header.fractional_bits, header.flags, 0)
     # Without the time, equal scenes give equal files.
@@ -264,7 +315,7 @@ def write_spz(content: SpzContent, handle: BinaryFile) -> None:
                 packed.write(piece)
 
 
-def _write_v4(content: SpzContent, handle: BinaryFile) -> None:
+def _write_v4(content: SpzContent, handle: BinaryFile, folder: Path | None) -> None:
     header = content.header
     present = [stream for stream, width in zip(content.streams, header.widths, strict=True) if width]
     fields = (header.version, header.count, header.sh_degree, header.fractional_bits, header.flags)
@@ -273,7 +324,7 @@ def _write_v4(content: SpzContent, handle: BinaryFile) -> None:
     sizes = []
     for stream in present:
         # Zstandard makes other bytes of a stream in pieces, so that it is put on disk, and mapped.
-        with tempfile.TemporaryFile() as spool:
+        with tempfile.TemporaryFile(dir=folder) as spool:
             for piece in stream:
                 spool.write(piece)
             spool.flush()

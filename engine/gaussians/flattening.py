@@ -18,6 +18,7 @@ from octasplat.engine.gaussians.rows import (
     allocate_rows,
     overwrite_rows,
     row_arrays,
+    select_into_files,
     select_rows,
     view_rows,
 )
@@ -200,7 +201,7 @@ def flatten(
         raise _invalid_error(path, invalid, source.count)
     if scene is None or not kept.any():
         raise SceneFileError(f"{path}: none of its {source.count} Gaussians has finite values only.")
-    gaussians = scene if kept.all() else scene.select(kept)
+    gaussians = scene if kept.all() else select_gaussians(scene, kept, folder)
     ratios = np.concatenate(thickness)
     report = ImportReport(
         count=len(gaussians),
@@ -251,11 +252,31 @@ def _allocate_scene(block: FlatGaussians, count: int, folder: Path | None) -> Fl
 
     Files spare memory and are no more than that: where there is no room for them, the scene is in memory.
     """
-    is_large = sum(array[:1].nbytes for array in row_arrays(block).values()) * count >= MANY_BYTES
-    if is_large:
+    if _are_many(block, count):
         with contextlib.suppress(DiskFullError):
             return allocate_rows(block, count, folder)
     return allocate_rows(block, count)
+
+
+def select_gaussians(
+    scene: FlatGaussians, mask: Bool[np.ndarray, " n"], folder: Path | None
+) -> FlatGaussians:
+    """Return a copy of the Gaussians in a mask.
+
+    Args:
+        scene: the scene.
+        mask: which of its Gaussians.
+        folder: for files without a name that hold them where these are many, as in :func:`flatten`.
+    """
+    if folder is not None and _are_many(scene, int(mask.sum())):
+        with contextlib.suppress(DiskFullError):
+            return select_into_files(scene, mask, folder)
+    return scene.select(mask)
+
+
+def _are_many(block: FlatGaussians, count: int) -> bool:
+    """Return whether so many Gaussians like those of a block are rather in files than in memory."""
+    return sum(array[:1].nbytes for array in row_arrays(block).values()) * count >= MANY_BYTES
 
 
 def _valid_mask(cloud: GaussianCloud) -> tuple[Bool[np.ndarray, " n"], dict[str, int]]:

@@ -2,7 +2,8 @@
 
 A pair becomes the Gaussian with the mean and the covariance of both, weighted by opacity times area, and
 flattened along its least extent (Runnalls, "Kullback-Leibler Approach to Gaussian Mixture Reduction",
-https://doi.org/10.1109/TAES.2007.4383588, section 2).
+https://doi.org/10.1109/TAES.2007.4383588, section 2). Its opacity times area is the integral of the alpha of
+both, composited as by a ray along its normal: where they overlap, that is less than their sum.
 """
 
 import numpy as np
@@ -81,6 +82,34 @@ class _Moments:
         within = _mean(self.covariances, first, second, share[:, :, None])
         return mass, mean, within + spread
 
+    def overlap(
+        self,
+        first: Int[np.ndarray, " p"],
+        second: Int[np.ndarray, " p"],
+        planes: Float64[np.ndarray, "p 3 2"],
+    ) -> Float64[np.ndarray, " p"]:
+        """Return by how much the sum of the masses of each pair exceeds the mass of both together.
+
+        Alphas a and b composite to a + b - a b. The last term is a product of Gaussians, whose integral over
+        a plane has a closed form.
+
+        Args:
+            first: row of one of each pair.
+            second: row of the other.
+            planes: axes, of unit length and orthogonal, in which they are looked at.
+        """
+        across = planes.transpose(0, 2, 1)
+        one, other = (across @ self.covariances[rows] @ planes for rows in (first, second))
+        both = one + other
+        x, y = (across @ (self.means[second] - self.means[first])[:, :, None])[:, :, 0].T
+        opacity = (self.masses[first] / self.areas[first]) * (self.masses[second] / self.areas[second])
+        # what is seen from its edge in both has no area
+        det = np.maximum(_determinant(both), np.finfo(np.float64).tiny)
+        squared = both[:, 1, 1] * x * x - 2.0 * both[:, 0, 1] * x * y + both[:, 0, 0] * y * y
+        area = np.sqrt(_determinant(one) / det) * np.sqrt(_determinant(other))
+        result = opacity * area * np.exp(-0.5 * np.maximum(squared, 0.0) / det)
+        return np.asarray(np.minimum(result, np.minimum(self.masses[first], self.masses[second])))
+
     def costs(self, first: Int[np.ndarray, " p"], second: Int[np.ndarray, " p"]) -> Float64[np.ndarray, " p"]:
         """Return what merging each pair loses: area and thickness that it gains, and difference of colors."""
         mass, _, covariance = self.mixture(first, second)
@@ -102,7 +131,7 @@ def _merge(
     mass, mean, covariance = moments.mixture(first, second)
     values, vectors = np.linalg.eigh(covariance)
     scales = np.sqrt(np.maximum(values[:, 1:], MIN_SCALE**2))
-    opacity = mass / scales.prod(axis=1)
+    opacity = (mass - moments.overlap(first, second, vectors[:, :, 1:])) / scales.prod(axis=1)
     # what two hide beside each other does not fit under one peak
     scales *= np.sqrt(np.maximum(opacity / MAX_OPACITY, 1.0))[:, None]
     opacity = np.minimum(opacity, MAX_OPACITY)
@@ -119,6 +148,12 @@ def _merge(
         sh=_mean(gaussians.sh, first, second, share[:, :, None]).astype(np.float32),
         channels=_merged_channels(gaussians, first, second, share),
     )
+
+
+def _determinant(matrices: Float64[np.ndarray, "p 2 2"]) -> Float64[np.ndarray, " p"]:
+    """Return determinants of symmetric matrices, which rounding does not make negative."""
+    product = matrices[:, 0, 0] * matrices[:, 1, 1]
+    return np.asarray(np.maximum(product - matrices[:, 0, 1] ** 2, 0.0))
 
 
 def _turned_to(vectors: Float64[np.ndarray, "p 3"], others: Float64[np.ndarray, "p 3"]) -> np.ndarray:

@@ -1,11 +1,11 @@
 """Selection of the files of a folder that are photographs to find poses for."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from octasplat.engine.core.errors import DatasetError
-from octasplat.engine.core.folder_files import files_below
+from octasplat.engine.core.folder_files import files_below, unreadable_folders_sentence
 from octasplat.engine.core.portable_names import unportable_names_sentence
 from octasplat.engine.core.scene_layout import (
     IMAGES,
@@ -55,9 +55,10 @@ def photographs_of_scene(scene: Path) -> list[str]:
 
 def notes_on_files(scene: Path) -> tuple[str, ...]:
     """Return sentences on the files of a folder that are left out, or bear names that others refuse."""
-    layout = _layout_of(scene)
-    unportable = unportable_names_sentence(layout.files)
-    return layout.notes if unportable is None else (*layout.notes, unportable)
+    unreadable: list[Path] = []
+    layout = lay_out_scene(_files_below(scene, unreadable.append))
+    others = unreadable_folders_sentence(unreadable, scene), unportable_names_sentence(layout.files)
+    return (*layout.notes, *(sentence for sentence in others if sentence is not None))
 
 
 def _check_folder(scene: Path) -> None:
@@ -73,9 +74,9 @@ def _layout_of(scene: Path) -> SceneLayout:
     return lay_out_scene(_files_below(scene))
 
 
-def _files_below(folder: Path) -> list[str]:
+def _files_below(folder: Path, on_unreadable: Callable[[Path], None] = lambda _folder: None) -> list[str]:
     """Return files by their paths below ``folder``, sorted, without hidden ones."""
-    found = (path.relative_to(folder).as_posix() for path in files_below(folder))
+    found = (path.relative_to(folder).as_posix() for path in files_below(folder, on_unreadable=on_unreadable))
     return sorted(name for name in found if not is_ignored_file(name))
 
 

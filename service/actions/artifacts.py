@@ -1,5 +1,6 @@
 """Results of jobs, and previews of running ones."""
 
+import asyncio
 import uuid
 
 from octasplat.service.actions.access import check_searchable_name, fetch_visible_job, read_job
@@ -11,7 +12,10 @@ from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
 from octasplat.workers.db.live_scenes import ShownScene, get_shown_scene
 from octasplat.workers.db.rows import Artifact, Job
 from octasplat.workers.queue import jobs as rows
-from octasplat.workers.storage.protocol import Blob
+from octasplat.workers.storage.protocol import Blob, Storage
+
+_PARALLEL_LOOKS = 4
+"""Results that are looked up at once for one request; others need threads too."""
 
 
 async def list_artifacts(service: Service, principal: Principal, job_id: uuid.UUID) -> list[Artifact]:
@@ -40,8 +44,26 @@ async def get_job_with_artifacts(
     if not found:
         raise not_found_error("result")
     # Before the answer begins, as nothing can be told from within a ZIP file.
-    await run_in_pool(ThreadPurpose.DOWNLOADS, lambda: [service.storage.stat(row.sha256) for row in found])
+    await _check_stored(service.storage, {row.sha256 for row in found})
     return job, found
+
+
+async def _check_stored(storage: Storage, contents: set[str]) -> None:
+    """Look up contents, some at once, as there may be thousands and a bucket takes a while for each.
+
+    Raises:
+        StorageError: the store does not have one.
+    """
+    left = iter(contents)  # all take from the same
+
+    def look_up() -> None:
+        for sha256 in left:
+            storage.stat(sha256)
+
+    looks = [run_in_pool(ThreadPurpose.DOWNLOADS, look_up) for _ in range(_PARALLEL_LOOKS)]
+    for result in await asyncio.gather(*looks, return_exceptions=True):
+        if result is not None:
+            raise result
 
 
 async def get_artifact(

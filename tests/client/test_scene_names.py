@@ -9,6 +9,8 @@ from typing import Any
 
 import pytest
 
+from octasplat.engine.core.errors import DatasetError
+from octasplat.engine.poses.photographs import notes_on_files
 from octasplat.workers.client.api import Api
 from octasplat.workers.client.submission import Submission, submit
 from octasplat.workers.client.upload import upload_scene
@@ -78,3 +80,39 @@ def test_folder_that_is_named_by_a_digest_is_sent(
         whole = str(uuid.UUID(name))
         submit(api, Submission(whole))
     assert [made.get("dataset_id") for made in service.made] == [None, "d", whole]
+
+
+def test_folder_that_cannot_be_read_is_told(
+    serve: Callable[..., Front], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """When a scene is sent, and when it is reconstructed here."""
+    for folder in ("images/left", "images/right", ".Trash"):
+        (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder / "a.jpg").write_bytes(b"x")
+    list_folder, warnings = Path.iterdir, list[str]()
+
+    def refuse_right(folder: Path) -> Any:
+        if folder.name in ("right", ".Trash"):
+            raise PermissionError(13, "Permission denied")
+        return list_folder(folder)
+
+    monkeypatch.setattr(Path, "iterdir", refuse_right)
+    with Api(serve(Scenes()).address) as api:
+        upload_scene(api, tmp_path, on_warning=warnings.append)
+    expected = "Files in folders that cannot be read are left out (images/right)."
+    assert warnings == [expected] and expected in notes_on_files(tmp_path)
+
+
+def test_file_that_goes_while_a_scene_is_listed_is_told(
+    serve: Callable[..., Front], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "a.jpg").write_bytes(b"x")
+    (tmp_path / "b.jpg").write_bytes(b"x")
+    service = Scenes()
+
+    def answer(method: str, path: str, headers: dict[str, str], body: bytes) -> Answer:
+        (tmp_path / "b.jpg").unlink(missing_ok=True)  # once it was listed
+        return service(method, path, headers, body)
+
+    with Api(serve(answer).address) as api, pytest.raises(DatasetError, match=r"b\.jpg cannot be read"):
+        upload_scene(api, tmp_path)

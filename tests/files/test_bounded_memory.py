@@ -79,6 +79,22 @@ def test_writing_takes_no_more_memory_for_more_gaussians(name: str, tmp_path: Pa
     assert growth(peaks) <= WRITTEN[name] + NOISE_BYTES
 
 
+def test_leaving_faint_gaussians_out_takes_no_copy_of_a_large_scene(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, options, peaks = tmp_path / "a.splats.glb", ExportOptions(min_opacity=0.5), []
+    export_scene(random_scene(100), path, options)
+    for count in COUNTS:
+        scene = random_scene(count)
+        monkeypatch.setattr(flattening, "MANY_BYTES", scene_bytes(scene) // 2)
+        peaks.append(peak_bytes(lambda: export_scene(scene, path, options)))  # noqa: B023
+    assert growth(peaks) <= 10 + NOISE_BYTES  # which are left
+    scene = random_scene(COUNTS[1])
+    left = scene.select(scene.opacities >= 0.5)
+    np.testing.assert_array_equal(read_scene(path)[0].means_world, left.means_world)
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
+
+
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("name", some_daily(READ, {"a.mesh.ply", "a.spz"}))
 def test_reading_takes_no_more_memory_than_the_scene(name: str, tmp_path: Path) -> None:

@@ -10,7 +10,14 @@ import pytest
 from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.core.errors import ConfigError, SceneFileError
 from octasplat.engine.edit.mesh_to_gaussians import recover_gaussians
-from octasplat.engine.files import ExportOptions, export_scene, glb_container, read_mesh, read_scene
+from octasplat.engine.files import (
+    ExportOptions,
+    export_scene,
+    glb_container,
+    octagon_batches,
+    read_mesh,
+    read_scene,
+)
 from octasplat.engine.files.kd_split import kd_split
 from octasplat.engine.files.octagon_glb_layout import OPAQUE_CUTOFF
 from octasplat.engine.files.textures import radial_alpha
@@ -186,6 +193,21 @@ def test_octagon_glb_ids_option_omits_ids(make_scene: Make, tmp_path: Path) -> N
     assert primitives
     for arrays in primitives:
         assert set(arrays) == {"POSITION", "COLOR_0", "TEXCOORD_0", "indices"}
+
+
+def test_scene_with_more_gaussians_than_numbers_is_written_without_them(
+    make_scene: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = make_scene(60)
+    monkeypatch.setattr(octagon_batches, "MAX_FLOAT_ID", 59)
+    for name in ("a.glb", "a.mesh.ply"):
+        with pytest.raises(SceneFileError, match=r"can number 59 Gaussians.*--no-ids"):
+            export_scene(scene, tmp_path / name)
+    export_scene(scene, tmp_path / "a.glb", ExportOptions(ids=False))
+    export_scene(scene, tmp_path / "a.viewer.glb")
+    shown = int((octagon_radii(scene.opacities) > 0).sum())
+    for name in ("a.glb", "a.viewer.glb"):
+        assert len(read_scene(tmp_path / name)[0]) == shown
 
 
 def test_octagon_glb_too_large_is_refused_before_writing(

@@ -2,6 +2,7 @@
 
 import os
 import stat
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -205,3 +206,17 @@ def test_sog_converter_error_is_quoted(
     with pytest.raises(SceneFileError, match=rf"a\.sog: converter {message}"):
         export_scene(make_flat(3, 0), tmp_path / "a.sog")
     assert not (tmp_path / "a.sog").exists()
+
+
+@pytest.mark.parametrize("name", ["a.sog", "a.spz"])
+def test_what_is_on_the_way_lies_beside_the_file(
+    make_flat: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """As the folder for temporary files is often in memory, and small."""
+    program = tmp_path / "converter"
+    program.write_text('#!/bin/sh\nfor last; do :; done\necho packed > "$last"\n')
+    program.chmod(program.stat().st_mode | stat.S_IXUSR)
+    monkeypatch.setenv("OCTASPLAT_SPLAT_TRANSFORM", os.fspath(program))
+    monkeypatch.setattr(tempfile, "tempdir", os.fspath(tmp_path / "none"))
+    export_scene(make_flat(3, 1), tmp_path / "new" / name, ExportOptions(spz_version=4))
+    assert [file.name for file in (tmp_path / "new").iterdir()] == [name]

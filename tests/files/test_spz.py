@@ -12,6 +12,8 @@ from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.files import importer_for, read_scene
 from octasplat.engine.files.gaussian_ply import read_ply_cloud
 from octasplat.engine.gaussians.flattening import GaussianCloud
+from octasplat.engine.gaussians.frames import rotation_matrices
+from octasplat.engine.gaussians.rows import concatenate_rows
 from octasplat.engine.gaussians.spherical_harmonics import sh_basis
 from tests.support.cloud_difference import difference
 
@@ -56,16 +58,28 @@ def pack(cloud: GaussianCloud, version: int, degree: int | None = None) -> tuple
     return header, [bytes(b) for b in (positions, alphas, colors, scales, rotations, harmonics)]
 
 
-def write_spz(path: Path, cloud: GaussianCloud, version: int) -> None:
+def write_spz(
+    path: Path, cloud: GaussianCloud, version: int, flags: int = 0, records: bytes = b"", tree: bytes = b""
+) -> None:
     header, streams = pack(cloud, version)
+    header = header[:14] + bytes([flags]) + header[15:]
     if version < 4:
-        path.write_bytes(gzip.compress(header + b"".join(streams)))
+        path.write_bytes(gzip.compress(header + b"".join(streams) + tree + records))
         return
     streams = [stream for stream in streams if stream]
     packed = [zstandard.ZstdCompressor().compress(stream) for stream in streams]
-    start = header[:15] + bytes([len(packed)]) + struct.pack("<I12x", 32)
+    start = header[:15] + bytes([len(packed)]) + struct.pack("<I12x", 32 + len(records)) + records
     table = b"".join(struct.pack("<QQ", len(p), len(s)) for p, s in zip(packed, streams, strict=True))
     path.write_bytes(start + table + b"".join(packed))
+
+
+def record(kind: int, content: bytes) -> bytes:
+    return struct.pack("<II", kind, len(content)) + content
+
+
+def covariances(cloud: GaussianCloud) -> np.ndarray:
+    axes = rotation_matrices(cloud.quats_wxyz.astype(np.float64)) * np.exp(cloud.log_scales)[:, None, :]
+    return axes @ axes.transpose(0, 2, 1)
 
 
 @pytest.mark.parametrize("version", [2, 3, 4])
@@ -124,6 +138,67 @@ def test_spz_oversized_header_is_refused(make_cloud: Make, tmp_path: Path) -> No
         read_scene(path)
     path.write_bytes(gzip.compress(header[:12] + b"\x09" + header[13:]))
     with pytest.raises(SceneFileError, match="harmonics of degree 9"):
+        read_scene(path)
+
+
+RIGHT_DOWN_FRONT = np.eye(3)
+RIGHT_UP_FRONT = np.diag([1, -1, 1])
+RIGHT_FRONT_UP = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+RIGHT_BACK_DOWN = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+
+
+@pytest.mark.parametrize("version", [3, 4])
+@pytest.mark.parametrize(
+    ("number", "world_from_file"),
+    [(6, RIGHT_DOWN_FRONT), (8, RIGHT_UP_FRONT), (12, RIGHT_FRONT_UP), (14, RIGHT_BACK_DOWN)],
+)
+def test_file_in_another_frame_is_turned(
+    make_cloud: Make, tmp_path: Path, version: int, number: int, world_from_file: np.ndarray
+) -> None:
+    path, cloud = tmp_path / "a.spz", make_cloud(50, 3)
+    write_spz(path, cloud, version)
+    plain = importer_for(path).read(path)
+    file_from_plain = np.diag([1, -1, -1])  # what the same numbers mean without a record
+    turn = world_from_file @ file_from_plain
+    records = record(0x12345678, b"else") + record(0xADBE0003, struct.pack("<I", number))
+    write_spz(path, cloud, version, flags=2, records=records)
+    turned = importer_for(path).read(path)
+    np.testing.assert_allclose(turned.means_world, plain.means_world @ turn.T, atol=1e-6)
+    np.testing.assert_allclose(covariances(turned), turn @ covariances(plain) @ turn.T, atol=1e-7)
+    before, after = (
+        np.einsum("k,nkc->nc", sh_basis(direction, 3), each.sh)
+        for direction, each in ((DIRECTION, plain), (turn @ DIRECTION, turned))
+    )
+    np.testing.assert_allclose(after, before, atol=1e-5)
+    _, report = read_scene(path)
+    assert any("0x12345678" in note for note in report.notes)
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_unknown_frame_is_refused(make_cloud: Make, tmp_path: Path, version: int) -> None:
+    path = tmp_path / "a.spz"
+    write_spz(path, make_cloud(5), version, flags=2, records=record(0xADBE0003, struct.pack("<I", 17)))
+    with pytest.raises(SceneFileError, match="coordinate system that is not known"):
+        read_scene(path)
+
+
+def test_finest_of_levels_is_read_with_whole_opacities(make_cloud: Make, tmp_path: Path) -> None:
+    path, leaves, coarse = tmp_path / "a.spz", make_cloud(17_000, 1), make_cloud(100, 1, seed=1)
+    # as Spark writes a tree: coarser Gaussians among the others, and half of each opacity
+    half = 0.5 / (1.0 + np.exp(-leaves.opacity_logits))
+    halved = replace(leaves, opacity_logits=np.log(half / (1.0 - half)))
+    both = concatenate_rows([coarse, halved])
+    counts = np.concatenate([np.full(100, 200), np.zeros(17_000)]).astype("<u2")
+    starts = np.concatenate([100 + 200 * np.arange(100), np.zeros(17_000)]).astype("<u4")
+    write_spz(path, both, 3, flags=0x80, tree=counts.tobytes() + starts.tobytes())
+    difference(importer_for(path).read(path), leaves).assert_below(
+        position=0.501 / 4096, rotation_degrees=0.3, log_scale=0.501 / 16, opacity=1.01 / 255, sh=0.015
+    )
+    scene, report = read_scene(path)
+    assert len(scene) == 17_000
+    assert any("17,000 of 17,100" in note for note in report.notes)
+    write_spz(path, both, 3, flags=0x80, tree=counts.tobytes()[:-1])
+    with pytest.raises(SceneFileError, match="is truncated"):
         read_scene(path)
 
 

@@ -3,6 +3,7 @@
 import errno
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.engine.gaussians.frames import frames_from_normals, quaternions_from_matrices
-from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 from octasplat.engine.gaussians.neighbor_pairs import choose_pairs
 from octasplat.engine.gaussians.rows import row_arrays
 from octasplat.engine.gaussians.simplification import simplify
@@ -54,6 +55,43 @@ def picture(gaussians: FlatGaussians) -> np.ndarray:
     return tracer.trace(RayBatch(origins, np.ascontiguousarray(directions), 0.0)).rgb_srgb
 
 
+def composited_mass(coplanar: FlatGaussians) -> float:
+    """Opacity times area of Gaussians in the plane z = 0 together, by their alphas on a fine grid."""
+    side = np.linspace(-3, 3, 1501)
+    points = np.stack(np.meshgrid(side, side), axis=-1)
+    seen = np.ones(points.shape[:2])
+    for mean, covariance, opacity in zip(
+        coplanar.means_world[:, :2], covariances(coplanar)[:, :2, :2], coplanar.opacities, strict=True
+    ):
+        away = points - mean
+        squares = np.einsum("xyi,ij,xyj->xy", away, np.linalg.inv(covariance), away)
+        seen *= 1.0 - float(opacity) * np.exp(-0.5 * squares)
+    return float((1.0 - seen).sum() * (side[1] - side[0]) ** 2 / (2 * np.pi))
+
+
+def test_two_in_one_place_are_no_wider_than_they_look() -> None:
+    """Alphas composite: of two with opacity a, 2 a - a^2 / 2 of the area of one is left, not 2 a."""
+    opacity, area = 0.7, 0.2 * 0.1
+    pair = FlatGaussians(
+        means_world=np.zeros((2, 3), np.float32),
+        quats_wxyz=np.tile(np.float32([1, 0, 0, 0]), (2, 1)),
+        log_scales=np.float32(np.log([[0.2, 0.1]] * 2)),
+        opacity_logits=np.full(2, np.log(opacity / (1 - opacity)), np.float32),
+        sh=np.zeros((2, 1, 3), np.float32),
+    )
+    one = simplify(pair, 1)
+    assert one.opacities[0] * one.scales.prod() == pytest.approx((2 * opacity - opacity**2 / 2) * area)
+    facing = replace(pair, means_world=np.float32([[0, 0, 0], [0.001, 0, 0]]))  # one behind the other
+    assert simplify(facing, 1).scales.prod() == pytest.approx(one.scales.prod(), rel=1e-3)
+
+
+def test_twice_the_same_ball_becomes_the_ball() -> None:
+    ball = sphere(1000)
+    twice = concatenate([ball, ball])
+    errors = np.sqrt(((picture(simplify(twice, 1000)) - picture(twice)) ** 2).mean())
+    assert errors < 0.015
+
+
 def test_pair_has_mass_mean_and_covariance_of_its_mixture() -> None:
     rng = np.random.default_rng(1)
     frames = frames_from_normals(np.array([[0, 0, 1.0], [0, 0, -1.0]]))
@@ -72,16 +110,17 @@ def test_pair_has_mass_mean_and_covariance_of_its_mixture() -> None:
     expected = np.einsum("n,nij->ij", share, covariances(pair) + apart[:, :, None] * apart[:, None, :])
     np.testing.assert_allclose(one.means_world[0], mean, atol=1e-6)
     np.testing.assert_allclose(covariances(one)[0], expected, atol=1e-6)
-    np.testing.assert_allclose(one.opacities[0] * one.scales.prod(), masses.sum(), rtol=1e-5)
+    np.testing.assert_allclose(one.opacities[0] * one.scales.prod(), composited_mass(pair), rtol=1e-4)
+    assert composited_mass(pair) < 0.98 * masses.sum()
     np.testing.assert_allclose(one.sh[0], np.einsum("n,nkc->kc", share, pair.sh), atol=1e-6)
     assert abs(one.rotations[0, 2, 0]) == pytest.approx(1)
 
 
-def test_opaque_neighbours_keep_their_mass_as_area() -> None:
+def test_opaque_neighbours_keep_what_they_cover_as_area() -> None:
     ball = sphere(400)
     fewer = simplify(ball, 100)
     mass = lambda g: float((g.opacities.astype(np.float64) * g.scales.prod(axis=1)).sum())  # noqa: E731
-    assert len(fewer) == 100 and mass(fewer) == pytest.approx(mass(ball), rel=1e-3)
+    assert len(fewer) == 100 and 0.8 * mass(ball) < mass(fewer) < 0.97 * mass(ball)  # they overlap
     assert fewer.opacities.max() <= 0.995 + 1e-6 and fewer.is_finite()
     outward = (fewer.rotations[:, :, 0] * fewer.means_world).sum(axis=1)
     assert (outward > 0).all()  # normals stay on their side

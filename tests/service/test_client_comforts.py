@@ -2,8 +2,10 @@
 
 import hashlib
 import io
+import itertools
 import json
 import logging
+import threading
 import uuid
 import zipfile
 from typing import Any
@@ -18,6 +20,7 @@ from octasplat.service.zip_stream import ZipEntry, stream_zip
 from octasplat.workers.db.live_scenes import LiveScene, put_live_scene
 from octasplat.workers.db.quotas import Quota, set_quota
 from octasplat.workers.queue.job_results import ResultFile
+from octasplat.workers.storage.protocol import Blob
 from tests.support.service_harness import (
     ConnectService,
     claim_job,
@@ -57,6 +60,26 @@ async def test_all_results_come_as_one_zip(connect_service: ConnectService) -> N
         assert (await http.get(f"/v1/jobs/{waiting['id']}/archive")).status_code == 404
         stranger = await client_with_token(service, "stranger", "read")
         assert (await http.get(f"/v1/jobs/{job['id']}/archive", headers=stranger)).status_code == 404
+
+
+async def test_results_are_looked_up_at_once_before_they_come_as_one_zip(
+    connect_service: ConnectService, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A bucket answers each look-up after some time, and thousands of results would let a client give up."""
+    async with connect_service() as (http, service):
+        job = await finished_job(http, service)
+        together, calls, stat = threading.Barrier(len(RESULTS)), itertools.count(), service.storage.stat
+
+        def stat_with_others(sha256: str) -> Blob:
+            if next(calls) < len(RESULTS):
+                together.wait(20)
+            return stat(sha256)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(service.storage, "stat", stat_with_others)
+            assert (await http.get(f"/v1/jobs/{job['id']}/archive")).status_code == 200
+        service.storage.delete(hashlib.sha256(RESULTS["empty.txt"]).hexdigest())
+        assert (await http.get(f"/v1/jobs/{job['id']}/archive")).status_code == 410
 
 
 def test_zip_is_made_in_pieces_however_large_its_entries_are() -> None:

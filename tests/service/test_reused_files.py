@@ -22,7 +22,7 @@ from octasplat.engine.core.events import Event, Noted
 from octasplat.service.actions import reused_files
 from octasplat.service.state import Service
 from octasplat.workers.cli.main import cli
-from octasplat.workers.client import dataset_files
+from octasplat.workers.client import dataset_files, upload
 from octasplat.workers.client.api import Api, ServiceError
 from octasplat.workers.client.upload import upload_files, upload_scene
 from octasplat.workers.db.quotas import Quota, set_quota
@@ -31,6 +31,7 @@ from octasplat.workers.maintenance.garbage_collection import collect_garbage_now
 from tests.support.front_end import FrontEnd
 from tests.support.model_builder import ColmapModelBuilder, photograph, photographs
 from tests.support.service_harness import BEARER, ConnectService, client_with_token
+from tests.support.zip_builder import ZipMember, build_zip
 
 SCENE = {**photographs(), **ColmapModelBuilder().files()}
 NAME, PICTURE = next(iter(photographs().items()))
@@ -340,6 +341,32 @@ def test_file_that_changes_after_it_was_read_is_refused(
             upload_scene(api, tmp_path / "scene")
         assert refused.value.status == 422
         assert upload_scene(api, tmp_path / "scene")["state"] == "committed"
+
+
+def test_scene_that_another_client_sends_and_commits_meanwhile_is_taken(
+    conninfo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As by the same command twice at once: a folder, a ZIP file in one request, and one in parts."""
+    folder, archive = tmp_path / "scene", tmp_path / "scene.zip"
+    noise_scene(folder, 3, 50)
+    archive.write_bytes(build_zip(*(ZipMember(name, content) for name, content in SCENE.items())))
+    with FrontEnd(conninfo, tmp_path / "data") as front, Api(front.address, front.token) as api:
+        for scene, min_resumable_bytes in ((folder, 1 << 30), (archive, 1 << 30), (archive, 1)):
+            others: list[Any] = []
+
+            def read_after_another(path: Path, scene: Path = scene, others: list[Any] = others) -> str:
+                if not others:
+                    others.append(None)
+                    others.append(upload_scene(api, scene)["id"])
+                return sha256(path.read_bytes())
+
+            with monkeypatch.context() as patch:
+                patch.setattr(upload, "MIN_RESUMABLE_BYTES", min_resumable_bytes)
+                for module in (dataset_files, upload):
+                    patch.setattr(module, "sha256_of", read_after_another)
+                dataset = upload_scene(api, scene)
+            assert (dataset["state"], dataset["id"]) == ("committed", others[1])
+            api.request("DELETE", f"/v1/datasets/{dataset['id']}")
 
 
 CLIENT = """

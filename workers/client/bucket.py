@@ -16,7 +16,12 @@ from octasplat.engine.core.errors import ConfigError, DatasetError
 from octasplat.engine.core.scene_layout import is_ignored_file
 from octasplat.workers.client.api import Api, ServiceError
 from octasplat.workers.client.dataset_files import ProgressCounter, keep_files
-from octasplat.workers.client.dataset_tasks import commit, create_dataset_once, import_scene, wait_for_task
+from octasplat.workers.client.dataset_tasks import (
+    create_dataset_once,
+    fill_and_commit,
+    import_scene,
+    wait_for_task,
+)
 from octasplat.workers.client.upload import preview_files
 
 if TYPE_CHECKING:
@@ -240,9 +245,7 @@ def _import_folder(
     for path, item in files.items():
         digest.update(f"{path}\0{item.size_bytes}\0{item.etag}\n".encode())
     dataset = create_dataset_once(api, {"name": name[:200]}, f"bucket-{digest.hexdigest()}")
-    if dataset["state"] == "open":
-        _fetch_files(api, dataset["id"], bucket, files, progress)
-    return commit(api, dataset)
+    return fill_and_commit(api, dataset, lambda: _fetch_files(api, dataset["id"], bucket, files, progress))
 
 
 def _fetch_files(

@@ -3,7 +3,7 @@
 import hashlib
 import time
 import uuid
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import PurePosixPath
 from typing import Any
 from urllib.parse import urlsplit
@@ -82,6 +82,32 @@ def commit(api: Api, dataset: dict[str, Any]) -> dict[str, Any]:
     return dataset
 
 
+def fill_and_commit(api: Api, dataset: dict[str, Any], fill: Callable[[], object]) -> dict[str, Any]:
+    """Fill a dataset if it is open, and commit it; returns it.
+
+    It was made for just these files, so that whoever sends the same at once and closes it has sent all.
+
+    Args:
+        api: the service.
+        dataset: from :func:`create_dataset_once`.
+        fill: sends what is lacking.
+
+    Raises:
+        ServiceError: the service refuses the files or the dataset.
+    """
+    if dataset["state"] == "open":
+        try:
+            fill()
+        except ServiceError as error:
+            # 409: it takes no files any more. 404: an upload is over, as its file is stored.
+            if error.status not in (httpx.codes.NOT_FOUND, httpx.codes.CONFLICT):
+                raise
+            dataset = api.get(f"/v1/datasets/{dataset['id']}")
+            if dataset["state"] == "open":
+                raise
+    return commit(api, dataset)
+
+
 def is_web_address(scene: object) -> bool:
     """Return whether a scene is named by an address that the service can fetch it from."""
     return isinstance(scene, str) and scene.startswith(("https://", "http://"))
@@ -114,7 +140,7 @@ def import_scene(
         else hashlib.sha256(f"{version}\n{sha256}\n{name}".encode()).hexdigest()
     )
     dataset = create_dataset_once(api, {"name": name[:200]}, f"import-{key}")
-    if dataset["state"] == "open":
-        task = api.post(f"/v1/datasets/{dataset['id']}/import", {"url": url, "sha256": sha256})
-        wait_for_task(api, task)
-    return commit(api, dataset)
+    body = {"url": url, "sha256": sha256}
+    return fill_and_commit(
+        api, dataset, lambda: wait_for_task(api, api.post(f"/v1/datasets/{dataset['id']}/import", body))
+    )

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from octasplat.engine.core.errors import DatasetError
-from octasplat.engine.core.folder_files import files_below
+from octasplat.engine.core.folder_files import files_below, unreadable_folders_sentence
 from octasplat.engine.core.scene_layout import is_ignored_file
 from octasplat.workers.client.api import Api
 from octasplat.workers.client.dataset_files import (
@@ -16,8 +16,9 @@ from octasplat.workers.client.dataset_files import (
     send_files,
     sha256_of,
 )
-from octasplat.workers.client.dataset_tasks import commit, create_dataset_once
+from octasplat.workers.client.dataset_tasks import create_dataset_once, fill_and_commit
 from octasplat.workers.client.resumable_upload import MIN_RESUMABLE_BYTES, send_resumable
+from octasplat.workers.client.upload_parts import file_size, unreadable_error
 
 _ARCHIVE_END_BYTES = 1 << 18
 """So much of the end of an archive is shown first; it holds the names of a thousand files."""
@@ -36,11 +37,13 @@ def list_scene_files(
     """
     if not scene.is_dir():
         raise DatasetError(f"{scene} is not a folder; name the folder that holds images/ and sparse/.")
-    paths = {
-        _replace_non_utf8(path.relative_to(scene).as_posix()): path for path in sorted(files_below(scene))
-    }
+    unreadable: list[Path] = []
+    found = sorted(files_below(scene, on_unreadable=unreadable.append))
+    if (sentence := unreadable_folders_sentence(unreadable, scene)) is not None:
+        on_warning(sentence)
+    paths = {_replace_non_utf8(path.relative_to(scene).as_posix()): path for path in found}
     listed = [
-        {"path": name, "size_bytes": path.stat().st_size}
+        {"path": name, "size_bytes": file_size(path)}
         for name, path in paths.items()
         if not is_ignored_file(name)
     ]
@@ -140,16 +143,14 @@ def upload_scene(
     """
     is_archive = scene.is_file()
     if is_archive:
-        files = [LocalFile(_replace_non_utf8(scene.name), scene, scene.stat().st_size)]
+        files = [LocalFile(_replace_non_utf8(scene.name), scene, file_size(scene))]
         _preview_archive(api, scene, on_warning)
     else:
         files = list_scene_files(api, scene, on_warning)
     dataset = _find_or_create_dataset(api, name or _replace_non_utf8(scene.resolve().stem), files)
     if is_archive and dataset["state"] == "open":
-        _send_archive(api, dataset["id"], files[0], progress)
-    else:
-        _send_folder(api, dataset, files, progress, on_note)
-    return commit(api, dataset)
+        return fill_and_commit(api, dataset, lambda: _send_archive(api, dataset["id"], files[0], progress))
+    return _send_folder(api, dataset, files, progress, on_note)
 
 
 def upload_files(
@@ -175,10 +176,9 @@ def upload_files(
     Raises:
         ServiceError: the service refuses it; the text names the files.
     """
-    local = [LocalFile(called, path, path.stat().st_size) for called, path in sorted(files.items())]
+    local = [LocalFile(called, path, file_size(path)) for called, path in sorted(files.items())]
     dataset = _find_or_create_dataset(api, name, local, holds="files")
-    _send_folder(api, dataset, local, progress, on_note)
-    return commit(api, dataset)
+    return _send_folder(api, dataset, local, progress, on_note)
 
 
 def _find_or_create_dataset(
@@ -188,7 +188,10 @@ def _find_or_create_dataset(
     digest = hashlib.sha256(f"{holds}\0{name}".encode() if holds == "files" else name.encode())
     for file in files:
         # In the place of the contents, which would all have to be read first.
-        facts = file.path.stat()
+        try:
+            facts = file.path.stat()
+        except OSError as error:
+            raise unreadable_error(file.path, error) from None
         digest.update(f"{file.name}\0{facts.st_size}\0{facts.st_mtime_ns}\0{facts.st_ino}\n".encode())
     body = {"name": name[:200]} | ({"holds": holds} if holds == "files" else {})
     return create_dataset_once(api, body, f"scene-{digest.hexdigest()}")
@@ -196,15 +199,23 @@ def _find_or_create_dataset(
 
 def _send_folder(
     api: Api,
-    dataset: Mapping[str, Any],
+    dataset: dict[str, Any],
     files: Sequence[LocalFile],
     progress: Callable[[int, int], None],
     on_note: Callable[[str], None],
-) -> None:
-    """Send the files that are lacking, and note those that are not; a dataset that is closed has them all."""
-    unsent = send_files(api, dataset["id"], files, progress) if dataset["state"] == "open" else files
-    if (sentence := describe_unsent(unsent, len(files))) is not None:
-        on_note(sentence)
+) -> dict[str, Any]:
+    """Send the files that are lacking, note those that are not, and commit the dataset; returns it.
+
+    A dataset that is closed has them all.
+    """
+
+    def note(unsent: Sequence[LocalFile]) -> None:
+        if (sentence := describe_unsent(unsent, len(files))) is not None:
+            on_note(sentence)
+
+    if dataset["state"] != "open":
+        note(files)
+    return fill_and_commit(api, dataset, lambda: note(send_files(api, dataset["id"], files, progress)))
 
 
 def _send_archive(api: Api, dataset_id: str, file: LocalFile, progress: Callable[[int, int], None]) -> None:
