@@ -38,5 +38,5 @@ def files_below(
 def unreadable_folders_sentence(folders: Sequence[Path], root: Path) -> str | None:
     """Return what to tell of folders below ``root`` that cannot be read; None for hidden ones or none."""
     names = sorted(folder.relative_to(root).as_posix() for folder in folders)
-    told = [name for name in names if name == "." or not is_ignored_file(name)]
-    return f"Files in folders that cannot be read are left out ({name_list(told)})." if told else None
+    visible = [name for name in names if name == "." or not is_ignored_file(name)]
+    return f"Files in folders that cannot be read are left out ({name_list(visible)})." if visible else None
