@@ -8,7 +8,6 @@ from octasplat.engine import __version__
 PACKAGES = (
     "embreex",  # Embree: which rays meet which boxes
     "fast-simplification",  # fewer triangles for surfaces
-    "flip-evaluator",
     "laspy",  # reads laser scans
     "llvmlite",  # compiles the kernels
     "numba",

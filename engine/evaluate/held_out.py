@@ -1,17 +1,18 @@
 """Renders the held-out views, measures them, and writes their pictures, ``metrics.json`` and the report."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
-import numba
 import numpy as np
 from jaxtyping import Float32
 
 from octasplat.engine.core.color import composite_over
 from octasplat.engine.core.events import EventListener, PhaseProgress, Warned, read_events
 from octasplat.engine.core.read_ahead import read_ahead
+from octasplat.engine.core.threads import threads_in_use
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.evaluate.advice import ViewFacts, advise, fine_detail, support_groups
@@ -45,6 +46,8 @@ from octasplat.engine.train.shading_factory import find_background, find_exposur
 
 MAX_COVERAGE_VIEWS = 24
 """Held-out views whose coverage is measured."""
+MAX_VIEWS_AT_ONCE = 4
+"""Views that are measured and written side by side; each holds several pictures in memory."""
 RENDERS, LAYERS, METRICS, REPORT = "renders", "layers", "metrics.json", "report.html"
 
 
@@ -97,16 +100,13 @@ def evaluate_held_out(
     images = WorstAndBestViews()
     photographs = [view.name for view in dataset.views]
     names = dict(zip(photographs, unique_render_names(photographs), strict=True))
-    for view, measured in _measure_views(
-        _render_views(dataset, tracer, shading, background, measures), threads or numba.get_num_threads()
+    for view, measured, known in _finish_views(
+        _render_views(dataset, tracer, shading, background, measures),
+        lambda view: _write_images(view, output, names[view.name]),
+        threads or threads_in_use(),
     ):
-        _write_images(view, output, names[view.name])
         rows.append(measured.metrics)
-        facts[view.name] = ViewFacts(
-            fine_detail(view.reference, view.weight),
-            fine_detail(view.render, view.weight),
-            view.support,
-        )
+        facts[view.name] = known
         if check is not None:
             check.add(view, measured.metrics.psnr)
         images.offer(
@@ -226,17 +226,31 @@ def _views_to_ask(dataset: Dataset) -> set[int]:
     return set(dataset.test_indices[places].tolist())
 
 
-def _measure_views(
-    views: Iterator[RenderedView], workers: int
-) -> Iterator[tuple[RenderedView, MeasuredView]]:
-    """Measure a few views side by side, in order; numpy and FLIP leave the interpreter free meanwhile."""
+class _FinishedView(NamedTuple):
+    view: RenderedView
+    measured: MeasuredView
+    facts: ViewFacts
+
+
+def _finish_views(
+    views: Iterator[RenderedView], write: Callable[[RenderedView], None], threads: int
+) -> Iterator[_FinishedView]:
+    """Measure and write a few views side by side, in order.
+
+    Kernels, numpy and the writing of files release the interpreter's lock. Threads beyond
+    ``MAX_VIEWS_AT_ONCE`` share the kernels.
+    """
+    workers = min(threads, MAX_VIEWS_AT_ONCE)
+
+    def finish(view: RenderedView) -> _FinishedView:
+        measured = measure_view(view, threads // workers)
+        write(view)
+        photograph_detail = fine_detail(view.reference, view.weight)
+        facts = ViewFacts(photograph_detail, fine_detail(view.render, view.weight), view.support)
+        return _FinishedView(view, measured, facts)
+
     if workers == 1:
-        yield from ((view, measure_view(view)) for view in views)
+        yield from map(finish, views)
         return
-
-    def measure(view: RenderedView) -> tuple[RenderedView, MeasuredView]:
-        return view, measure_view(view)
-
     with ThreadPoolExecutor(workers) as pool:
-        # No more may wait, as each view holds several pictures.
-        yield from read_ahead(measure, views, pool, workers + 1)
+        yield from read_ahead(finish, views, pool, workers + 1)

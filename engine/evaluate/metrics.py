@@ -1,8 +1,8 @@
 """Image metrics: PSNR, SSIM in two variants, MS-SSIM and FLIP.
 
-All take images of display values in [0, 1] and compute in float64. ``ssim`` is not one number: the papers on
-Gaussian splatting pad the image with zeros, its inventors keep only windows that lie wholly inside, and the
-two differ in the second decimal; both are here under names of their own. Sources:
+All take images of display values in [0, 1] and compute in float64, FLIP excepted. ``ssim`` is not one number:
+the papers on Gaussian splatting pad the image with zeros, its inventors keep only windows that lie wholly
+inside, and the two differ in the second decimal; both are here under names of their own. Sources:
 
 - SSIM: "Image Quality Assessment: From Error Visibility to Structural Similarity"
   (https://doi.org/10.1109/TIP.2003.819861);
@@ -13,12 +13,13 @@ two differ in the second decimal; both are here under names of their own. Source
 
 from typing import NamedTuple
 
-import flip_evaluator
 import numpy as np
-from jaxtyping import Float, Float32, Float64
-from scipy.ndimage import correlate1d
+from jaxtyping import Float32, Float64
 
 from octasplat.engine.core.color import to_bytes
+from octasplat.engine.core.compilation import run_ranges
+from octasplat.engine.evaluate.flip import flip_error
+from octasplat.engine.evaluate.kernels.ssim import ImagePair, SsimFilter, ssim_rows
 
 # Window and constants of the SSIM paper; the weights are those of the MS-SSIM paper.
 SSIM_WINDOW = 11
@@ -26,6 +27,8 @@ SSIM_SIGMA = 1.5
 SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
 MS_SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
+MIN_ROWS = 16
+"""Rows of an image that are worth a thread."""
 # FLIP's default viewer: 0.7 m from a screen that is 0.7 m wide and has 3840 pixels
 PIXELS_PER_DEGREE = 67.0
 
@@ -61,6 +64,22 @@ class FlipError(NamedTuple):
 
     error: Float32[np.ndarray, "h w"]
     mean: float
+
+
+class StructuralSimilarity(NamedTuple):
+    """SSIM in both variants, and MS-SSIM, see the functions of these names."""
+
+    ssim: float
+    ssim_valid: float
+    ms_ssim: float | None
+
+
+class _ChannelMeans(NamedTuple):
+    """Means of SSIM over all windows and over those inside the image, and of structure over the latter."""
+
+    ssim: Float64[np.ndarray, " c"]
+    ssim_valid: Float64[np.ndarray, " c"]
+    structure: Float64[np.ndarray, " c"]
 
 
 def quantize_8_bit(image: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
@@ -117,17 +136,8 @@ def ssim_both(
     With ``weight``, how much each pixel counts, the means are over the windows around pixels that do;
     not-a-number where none does.
     """
-    luminance, structure = _ssim_terms(render.astype(np.float64), reference.astype(np.float64))
-    similarity = luminance * structure
-    inner = _crop_window_margin(similarity)
-    if weight is None or (weight == 1).all():
-        return float(similarity.mean()), float(inner.mean()) if inner.size else float("nan")
-    valid = (
-        float(_weighted_channel_means(inner, _crop_window_margin(weight)).mean())
-        if inner.size
-        else float("nan")
-    )
-    return float(_weighted_channel_means(similarity, weight).mean()), valid
+    means = _channel_means(render, reference, _weight_unless_whole(weight), threads=1)
+    return float(means.ssim.mean()), float(means.ssim_valid.mean())
 
 
 def ms_ssim(
@@ -145,50 +155,51 @@ def ms_ssim(
         The index, or ``None`` when the smaller side is 160 pixels or less, too small for the fifth scale, or
         when no window counts at some scale.
     """
+    return structural_similarity(render, reference, weight).ms_ssim
+
+
+def structural_similarity(
+    render: Float32[np.ndarray, "h w 3"],
+    reference: Float32[np.ndarray, "h w 3"],
+    weight: Float32[np.ndarray, "h w"] | None = None,
+    threads: int = 1,
+) -> StructuralSimilarity:
+    """Return ``ssim``, ``ssim_valid`` and ``ms_ssim``, whose finest scale is filtered once for all."""
+    weight = _weight_unless_whole(weight)
+    means = _channel_means(render, reference, weight, threads)
+    plain = float(means.ssim.mean()), float(means.ssim_valid.mean())
     if min(render.shape[:2]) <= (SSIM_WINDOW - 1) * 2 ** (len(MS_SSIM_WEIGHTS) - 1):
-        return None
-    x, y = render.astype(np.float64), reference.astype(np.float64)
-    counts = np.ones((*render.shape[:2], 1)) if weight is None else weight[..., None].astype(np.float64)
-    is_whole = bool((counts == 1).all())
-    product = np.ones(3)
-    for scale, exponent in enumerate(MS_SSIM_WEIGHTS):
-        luminance, structure = _ssim_terms(x, y)
-        last = scale == len(MS_SSIM_WEIGHTS) - 1
+        return StructuralSimilarity(*plain, None)
+    product = np.maximum(means.structure, 0.0) ** MS_SSIM_WEIGHTS[0]
+    last = len(MS_SSIM_WEIGHTS) - 1
+    for scale in range(1, last + 1):
+        render, reference = _downsample_by_two(render), _downsample_by_two(reference)
+        weight = None if weight is None else _downsample_by_two(weight[..., None])[..., 0]
+        means = _channel_means(render, reference, weight, threads)
         # Luminance counts at the coarsest scale only, as in the paper.
-        values = _crop_window_margin(luminance * structure if last else structure)
-        mean = (
-            values.mean(axis=(0, 1))
-            if is_whole
-            else _weighted_channel_means(values, _crop_window_margin(counts)[..., 0])
-        )
-        product *= np.maximum(mean, 0.0) ** exponent
-        if not last:
-            x, y, counts = _downsample_by_two(x), _downsample_by_two(y), _downsample_by_two(counts)
-    return float(product.mean()) if np.isfinite(product).all() else None
+        mean = means.ssim_valid if scale == last else means.structure
+        product *= np.maximum(mean, 0.0) ** MS_SSIM_WEIGHTS[scale]
+    return StructuralSimilarity(*plain, float(product.mean()) if np.isfinite(product).all() else None)
 
 
 def flip(
     render: Float32[np.ndarray, "h w 3"],
     reference: Float32[np.ndarray, "h w 3"],
     weight: Float32[np.ndarray, "h w"] | None = None,
+    threads: int = 1,
 ) -> FlipError:
     """Return LDR-FLIP: the differences that a viewer notices when the two images alternate.
 
-    Computed by NVIDIA's own library for a screen of 67 pixels per degree. With ``weight`` the mean is over
-    the pixels that count, not-a-number where none does.
+    For a screen of 67 pixels per degree. With ``weight`` the mean is over the pixels that count,
+    not-a-number where none does.
     """
-    error, _, _ = flip_evaluator.evaluate(
-        np.ascontiguousarray(reference, dtype=np.float32),
-        np.ascontiguousarray(render, dtype=np.float32),
-        "LDR",
-        applyMagma=False,
-        computeMeanError=False,
-        parameters={"ppd": PIXELS_PER_DEGREE},
-    )
-    error = np.asarray(error, dtype=np.float32).reshape(render.shape[:2])
-    if weight is None or (weight == 1).all():
+    error = flip_error(render, reference, PIXELS_PER_DEGREE, threads)
+    weight = _weight_unless_whole(weight)
+    if weight is None:
         return FlipError(error, float(error.mean(dtype=np.float64)))
-    return FlipError(error, float(_weighted_channel_means(error[..., None].astype(np.float64), weight)[0]))
+    total = float(weight.sum(dtype=np.float64))
+    mean = float((error.astype(np.float64) * weight).sum()) / total if total > 0 else float("nan")
+    return FlipError(error, mean)
 
 
 def _gaussian_window() -> Float64[np.ndarray, "taps"]:
@@ -197,46 +208,55 @@ def _gaussian_window() -> Float64[np.ndarray, "taps"]:
     return np.asarray(window / window.sum())
 
 
-def _gaussian_blur(image: Float64[np.ndarray, "h w 3"]) -> Float64[np.ndarray, "h w 3"]:
-    window = _gaussian_window()
-    for axis in (0, 1):
-        image = correlate1d(image, window, axis=axis, mode="constant", cval=0.0)
-    return image
+def _weight_unless_whole(
+    weight: Float32[np.ndarray, "h w"] | None,
+) -> Float32[np.ndarray, "h w"] | None:
+    """Return the weights, or None where all pixels count."""
+    return None if weight is None or (weight == 1).all() else weight
 
 
-def _ssim_terms(
-    x: Float64[np.ndarray, "h w 3"], y: Float64[np.ndarray, "h w 3"]
-) -> tuple[Float64[np.ndarray, "h w 3"], Float64[np.ndarray, "h w 3"]]:
-    """Return the luminance term and the contrast-structure term of SSIM per pixel, with zero padding."""
-    mean_x, mean_y = _gaussian_blur(x), _gaussian_blur(y)
-    # Variances as E(x^2) - E(x)^2 under the window
-    variance_x = _gaussian_blur(x * x) - mean_x * mean_x
-    variance_y = _gaussian_blur(y * y) - mean_y * mean_y
-    covariance = _gaussian_blur(x * y) - mean_x * mean_y
-    luminance = (2 * mean_x * mean_y + SSIM_C1) / (mean_x * mean_x + mean_y * mean_y + SSIM_C1)
-    structure = (2 * covariance + SSIM_C2) / (variance_x + variance_y + SSIM_C2)
-    return luminance, structure
-
-
-def _weighted_channel_means(
-    values: Float64[np.ndarray, "h w c"], weight: Float[np.ndarray, "h w"]
-) -> Float64[np.ndarray, "c"]:
-    """Return the weighted mean of each channel; not-a-number where the weights are 0."""
-    total = float(weight.sum(dtype=np.float64))
-    if total <= 0:
-        return np.full(values.shape[-1], np.nan)
-    return np.asarray((values * weight[..., None]).sum(axis=(0, 1)) / total)
-
-
-def _crop_window_margin(values: Float[np.ndarray, "h w *c"]) -> Float[np.ndarray, "a b *c"]:
+def _channel_means(
+    render: Float32[np.ndarray, "h w c"],
+    reference: Float32[np.ndarray, "h w c"],
+    weight: Float32[np.ndarray, "h w"] | None,
+    threads: int,
+) -> _ChannelMeans:
+    """Return the weighted means of SSIM's terms; not-a-number where no window counts."""
+    height, width, channels = render.shape
+    counts = np.ones((height, width), np.float32) if weight is None else weight
+    # Each row is summed up by itself: the same sums on any number of threads
+    sums = np.zeros((height, 3, channels))
+    images = ImagePair(
+        np.ascontiguousarray(render, np.float32).reshape(height, -1),
+        np.ascontiguousarray(reference, np.float32).reshape(height, -1),
+        np.ascontiguousarray(counts, np.float32),
+    )
+    run_ranges(
+        ssim_rows,
+        threads,
+        height,
+        images,
+        SsimFilter(_gaussian_window(), SSIM_C1, SSIM_C2),
+        sums,
+        grain=MIN_ROWS,
+    )
     reach = SSIM_WINDOW // 2
-    return values[reach : values.shape[0] - reach, reach : values.shape[1] - reach]
+    inner = counts[reach : max(height - reach, 0), reach : max(width - reach, 0)]
+    totals = [float(part.sum(dtype=np.float64)) for part in (counts, inner, inner)]
+    return _ChannelMeans(
+        *(
+            part / total if total > 0 else np.full(channels, np.nan)
+            for part, total in zip(sums.sum(axis=0), totals, strict=True)
+        )
+    )
 
 
-def _downsample_by_two(image: Float64[np.ndarray, "h w c"]) -> Float64[np.ndarray, "a b c"]:
+def _downsample_by_two(image: Float32[np.ndarray, "h w c"]) -> Float32[np.ndarray, "a b c"]:
     """Return means of 2x2 blocks; odd sides get a black line before them, which counts as image."""
     odd = [(side % 2, 0) for side in image.shape[:2]]
-    even = np.pad(image, [*odd, (0, 0)])
     # The reference implementation pads both sides and floors, which drops the padding at the far end.
-    h, w = even.shape[0] // 2, even.shape[1] // 2
-    return np.asarray(even.reshape(h, 2, w, 2, -1).mean(axis=(1, 3)))
+    even = np.pad(image, [*odd, (0, 0)]) if any(before for before, _ in odd) else image
+    total = np.add(even[::2, ::2], even[1::2, ::2], dtype=np.float64)
+    total += even[::2, 1::2]
+    total += even[1::2, 1::2]
+    return (0.25 * total).astype(np.float32)

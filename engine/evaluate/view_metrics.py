@@ -15,9 +15,8 @@ from octasplat.engine.evaluate.metrics import (
     DEFINITIONS,
     fill_invalid,
     flip,
-    ms_ssim,
     quantize_8_bit,
-    ssim_both,
+    structural_similarity,
 )
 from octasplat.engine.evaluate.view_support import Support
 
@@ -127,11 +126,15 @@ class Metrics:
         }
 
 
-def measure_view(view: RenderedView) -> MeasuredView:
+def measure_view(view: RenderedView, threads: int = 1) -> MeasuredView:
     """Measure all metrics of one view.
 
     Render and reference are rounded to 8 bits first, as they would be in files. Pixels that the weight rules
     out do not count; where metrics look at the neighbourhood of others, they show what the reference shows.
+
+    Args:
+        view: what is measured.
+        threads: for the kernels of the metrics.
 
     Raises:
         DatasetError: Render and reference differ in size, or the render has pixels that are no number.
@@ -146,8 +149,8 @@ def measure_view(view: RenderedView) -> MeasuredView:
     reference = quantize_8_bit(view.reference)
     render = quantize_8_bit(view.render)
     filled = fill_invalid(render, reference, view.weight)
-    padded, valid = ssim_both(filled, reference, view.weight)
-    flip_map, mean_flip = flip(filled, reference, view.weight)
+    similarity = structural_similarity(filled, reference, view.weight, threads)
+    flip_map, mean_flip = flip(filled, reference, view.weight, threads)
     height, width = view.weight.shape
     metrics = ViewMetrics(
         name=view.name,
@@ -155,9 +158,9 @@ def measure_view(view: RenderedView) -> MeasuredView:
         height=height,
         psnr=psnr(render, reference, view.weight),
         psnr_colour_corrected=psnr(fit_color(render, reference, view.weight), reference, view.weight),
-        ssim=_none_if_nan(padded),
-        ssim_valid=_none_if_nan(valid),
-        ms_ssim=ms_ssim(filled, reference, view.weight),
+        ssim=_none_if_nan(similarity.ssim),
+        ssim_valid=_none_if_nan(similarity.ssim_valid),
+        ms_ssim=similarity.ms_ssim,
         flip=_none_if_nan(mean_flip),
         psnr_foreground=_psnr_foreground(render, reference, view.weight, view.alpha),
         depth_spread=view.depth_spread,

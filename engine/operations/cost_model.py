@@ -38,8 +38,8 @@ _DECODE_CPU_SECONDS_PER_PIXEL = 1.2e-8
 _LOAD_CPU_SECONDS_PER_PIXEL = 2.0e-8
 """Measured with 2,000 JPEG files of 12 MP: 1.3e-8; PNG takes longer."""
 _LIFT_CPU_SECONDS_PER_POINT = 7.0e-5
-_EVALUATE_CPU_SECONDS_PER_PIXEL = 4.5e-6
-"""Between 2.7e-6 for small pictures and 8.7e-6 for 3 MP on a busy machine; FLIP takes 2.2e-6 of it."""
+_EVALUATE_CPU_SECONDS_PER_PIXEL = 2.2e-6
+"""2.6e-6 for 3 MP on a busy machine, of which tracing takes 1.0e-6 and more the more Gaussians there are."""
 _EVALUATE_CPU_SECONDS_PER_VIEW = 0.35
 """For what does not shrink with the picture: 125 views of 320 x 240 pixels took 73 s."""
 _RENDER_CPU_SECONDS_PER_PIXEL = 1.5e-6

@@ -14,6 +14,31 @@ from octasplat.engine.shading.plain import PLAIN_SHADING
 from octasplat.engine.trace.protocol import TraceSettings
 
 
+def a_gray_gaussian():
+    return FlatGaussians(
+        np.zeros((1, 3), np.float32),
+        np.array([[1, 0, 0, 0]], np.float32),
+        np.zeros((1, 2), np.float32),
+        np.zeros(1, np.float32),
+        np.zeros((1, 1, 3), np.float32),
+    )
+
+
+def evaluate(data, output, threads):
+    evaluate_held_out(
+        data,
+        a_gray_gaussian(),
+        output,
+        settings=TraceSettings(),
+        shading=PLAIN_SHADING,
+        background="black",
+        run={},
+        config={},
+        threads=threads,
+        progress=lambda _event: None,
+    )
+
+
 def test_same_stem_photographs_get_own_renders(tmp_path):
     import pycolmap
 
@@ -31,25 +56,24 @@ def test_same_stem_photographs_get_own_renders(tmp_path):
     model.write(root / "sparse" / "0")
     held_out = ["a.png", "a.tif"]
     data = Dataset.open(root, tmp_path / "cache", held_out=held_out)
-    grey = FlatGaussians(
-        np.zeros((1, 3), np.float32),
-        np.array([[1, 0, 0, 0]], np.float32),
-        np.zeros((1, 2), np.float32),
-        np.zeros(1, np.float32),
-        np.zeros((1, 1, 3), np.float32),
-    )
     output = tmp_path / "out"
-    evaluate_held_out(
-        data,
-        grey,
-        output,
-        settings=TraceSettings(),
-        shading=PLAIN_SHADING,
-        background="black",
-        run={},
-        config={},
-        threads=1,
-        progress=lambda _event: None,
-    )
+    evaluate(data, output, threads=1)
     assert sorted(path.name for path in (output / "renders").iterdir()) == ["a.png.png", "a.tif.png"]
     assert sorted(json.loads((output / "metrics.json").read_text())["views"]) == held_out
+
+
+def test_views_have_the_same_results_on_any_number_of_threads(tmp_path):
+    config = SyntheticDatasetConfig(views=12, width_px=72, height_px=54, samples_per_side=1, points=100)
+    write_synthetic_dataset(tmp_path / "scene", config)
+    data = Dataset.open(tmp_path / "scene", tmp_path / "cache", test_every=2)
+    results = []
+    for threads in (1, 3, 9):
+        output = tmp_path / str(threads)
+        evaluate(data, output, threads)
+        files = sorted(path for path in output.rglob("*") if path.is_file())
+        results.append({path.relative_to(output).as_posix(): path.read_bytes() for path in files})
+    assert sum(name.startswith("renders/") for name in results[0]) == 6
+    assert list(json.loads(results[0]["metrics.json"])["views"]) == [
+        data.views[index].name for index in data.test_indices
+    ]
+    assert results[0] == results[1] == results[2]

@@ -67,6 +67,20 @@ def test_shrinking_keeps_the_shape_and_the_mean_and_never_enlarges(picture):
     assert image_files.shrink_to(big, 180) is big
 
 
+def test_shrinking_agrees_with_openimageio_away_from_the_borders():
+    rng = np.random.default_rng(0)
+    big = rng.random((150, 200, 4)).astype(np.float32)
+    source = oiio.ImageBuf(oiio.ImageSpec(200, 150, 4, oiio.FLOAT))
+    source.set_pixels(source.roi, big)
+    resized = oiio.ImageBufAlgo.resize(source, filtername="lanczos3", roi=oiio.ROI(0, 80, 0, 60, 0, 1, 0, 4))
+    expected = resized.get_pixels(oiio.FLOAT).reshape(60, 80, 4)
+    shrunk = image_files.shrink_to(big, 80)
+    np.testing.assert_allclose(shrunk[5:-5, 5:-5], expected[5:-5, 5:-5], atol=1e-4)
+    np.testing.assert_allclose(
+        image_files.shrink_to(np.full((90, 70, 1), 0.3, np.float32), 31), 0.3, atol=1e-6
+    )
+
+
 def test_read_image_invalid_file_is_named(tmp_path):
     with pytest.raises(DatasetError, match=r"missing\.png"):
         image_files.read_image(tmp_path / "missing.png")
