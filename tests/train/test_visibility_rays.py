@@ -90,6 +90,50 @@ def test_visibility_loss_of_occluders_has_opacity_gradient() -> None:
         assert found.opacity_logits[row] == pytest.approx(slope, rel=0.03)
 
 
+def test_lines_that_are_hidden_less_than_allowed_have_no_gradient() -> None:
+    world = SeenWorld()
+    veil = world.initial_gaussians(count=40, opacity=0.5)
+    veil.means_world[:, 2] = -0.5
+    tracer = make_tracer()
+    tracer.build(veil, np.zeros((40, 0), np.float32))
+    lines = VisibilityRays.from_dataset(world, 0.0).draw(np.random.default_rng(0), 500)
+    hidden = 1 - tracer.transmittance(lines)
+    allowed = float(np.sort(hidden)[250:252].mean())
+    assert hidden.min() < allowed < hidden.max()
+    _, by_all = free_space_gradient(lines, tracer, 0.3)
+    _, by_some = free_space_gradient(lines, tracer, 0.3, min_hidden=allowed)
+    assert by_all.transmittance is not None and by_some.transmittance is not None
+    np.testing.assert_array_equal(by_all.transmittance, np.float32(-0.3 / 500))
+    expected = np.where(hidden >= allowed, np.float32(-0.3 / 500), np.float32(0.0))
+    np.testing.assert_array_equal(by_some.transmittance, expected)
+
+
+@pytest.mark.parametrize(("hidden_from", "is_kept"), [(None, False), (0.6, True)])
+def test_training_keeps_a_faint_veil_where_it_may_hide_as_much(
+    tmp_path: Path, hidden_from: float | None, is_kept: bool
+) -> None:
+    world = SeenWorld()
+    start = world.initial_gaussians(painted=True, opacity=0.9)
+    veil = world.initial_gaussians(count=60, painted=True, opacity=0.3)
+    veil.means_world[:, 2] = -0.6
+    lines = VisibilityRays.from_dataset(world, 0.05).draw(np.random.default_rng(1), 2000)
+    hidden = []
+    for weight in (0.0, 0.1):
+        config = TrainConfig(
+            iterations=60, rays_per_batch=1024, rebuild_every=20, densify_from_iter=1000,
+            plane_sweep_init=False, visibility_ray_fraction=0.25,
+            loss=LossWeights(free_space=weight, free_space_from=hidden_from),
+        )  # fmt: skip
+        state = initial_state(concatenate([start.copy(), veil.copy()]), seed=0)
+        folder = tmp_path / str(weight)
+        trainer = Trainer(world, config, state, folder=folder, fingerprint="", progress=ignore_events)
+        done = trainer.run()
+        tracer = make_tracer()
+        tracer.build(done, np.zeros((len(done), 0), np.float32))
+        hidden.append(float(1 - tracer.transmittance(lines).mean()))
+    assert (hidden[1] > 0.6 * hidden[0]) == is_kept
+
+
 def test_training_removes_veil_only_along_visibility_rays(tmp_path: Path) -> None:
     world = SeenWorld()
     hidden = {}

@@ -24,7 +24,7 @@ class LossWeights(Settings):
     """
 
     former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.LOSS
-    later_settings: ClassVar[frozenset[str]] = frozenset({"depth", "edges"})
+    later_settings: ClassVar[frozenset[str]] = frozenset({"depth", "edges", "free_space_from"})
 
     l1: Annotated[float, Unit("weight"), ADVANCED] = Field(
         0.8,
@@ -61,6 +61,14 @@ class LossWeights(Settings):
         ge=0,
         description="Weight of what hides the sparse points from views that show them: free space along "
         "their lines of sight. Raise it where something floats before the cameras; materials use 0.05.",
+    )
+    free_space_from: Annotated[float | None, Unit("hidden share"), EXPERIMENTAL] = Field(
+        None,
+        ge=0,
+        lt=1,
+        description="Share of a line of sight from which on, where it is hidden, loss.free_space counts; by "
+        "default any. Lines that graze a surface are dimmed a little by the Gaussians of its outlines: try "
+        "0.3 where outlines or thin parts come out too thin.",
     )
     depth: Annotated[float | None, Unit("weight"), ADVANCED] = Field(
         None,

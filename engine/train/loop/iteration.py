@@ -95,7 +95,11 @@ def loss_and_gradients(
         grad_trace = replace(grad_trace, ray_errors=ray_errors(render, batch.target_srgb, batch.weight))
     recorded = [(result.recording, grad_trace), *grad_shading.recorded_traces]
     if batch.visibility_rays is not None:
-        recorded.append(free_space_gradient(batch.visibility_rays, tracer, weights.free_space))
+        recorded.append(
+            free_space_gradient(
+                batch.visibility_rays, tracer, weights.free_space, min_hidden=weights.free_space_from or 0.0
+            )
+        )
     if batch.edge_batch is not None:
         recorded.append(
             edge_gradient(batch.edge_batch, tracer, shading, weights, training_progress=training_progress)

@@ -110,14 +110,17 @@ class VisibilityRays:
 
 
 def free_space_gradient(
-    visibility_rays: RayBatch, tracer: Tracer, weight: float
+    visibility_rays: RayBatch, tracer: Tracer, weight: float, *, min_hidden: float = 0.0
 ) -> tuple[Recording, TraceGradients]:
-    """Return the recording of visibility rays, and gradients of ``weight`` times their mean hidden share."""
+    """Return the recording of visibility rays, and gradients of ``weight`` times their mean hidden share.
+
+    Of each ray's hidden share the part above ``min_hidden`` counts: rays that graze the surface are dimmed by
+    the tails of the Gaussians that outlines are made of.
+    """
     result = tracer.trace(visibility_rays, record=True)
     assert result.recording is not None
     no_color = np.zeros_like(result.rgb_srgb)
-    return result.recording, TraceGradients(
-        # dL/dT: hidden share is 1 - T
-        no_color,
-        transmittance=np.full(len(visibility_rays), -weight / len(visibility_rays), np.float32),
-    )
+    counts = result.alpha >= min_hidden
+    # dL/dT: hidden share is 1 - T
+    by_transmittance = np.where(counts, np.float32(-weight / len(visibility_rays)), np.float32(0.0))
+    return result.recording, TraceGradients(no_color, transmittance=by_transmittance)
