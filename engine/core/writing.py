@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +12,8 @@ from octasplat.engine.core.errors import DiskFullError
 
 DISK_FULL_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 """Errors of the system that mean a full disk, a spent quota, or a limit on the size of files."""
+_MIN_FREE_BYTES = 16 << 20
+"""Room for what a library writes at a time, as into a database."""
 
 
 @contextmanager
@@ -26,6 +29,13 @@ def report_disk_full(path: Path) -> Iterator[None]:
         if error.errno not in DISK_FULL_ERRORS:
             raise
         raise DiskFullError(f"{path} cannot be written ({error.strerror}); free space there.") from error
+
+
+def full_disk_error(folder: Path) -> DiskFullError | None:
+    """Return the likely cause where a library fails that tells of no full disk; None if there is room."""
+    if shutil.disk_usage(folder).free >= _MIN_FREE_BYTES:
+        return None
+    return DiskFullError(f"{folder} cannot be written ({os.strerror(errno.ENOSPC)}); free space there.")
 
 
 @contextmanager

@@ -15,6 +15,7 @@ from typing import NoReturn
 
 from octasplat.engine.core.errors import DatasetError, DiskFullError
 from octasplat.engine.core.events import Event
+from octasplat.engine.core.writing import full_disk_error, report_disk_full
 from octasplat.engine.poses.config import FOUND_FOLDER, PoseSearchRequest
 
 _CRASH_SIGNALS = (signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL)
@@ -44,24 +45,26 @@ def main() -> NoReturn:
 
         for number in _CRASH_SIGNALS:
             signal.signal(number, signal.SIG_DFL)
-        if request.lenses_of is not None:
-            write_per_view_principal_points(request, request.lenses_of, tell)
-        elif request.given is not None:
-            repair_misplaced(request, request.given, tell)
-        else:
-            search = PoseSearch(
-                request.images, request.names, request.work, request.config, request.threads, tell
-            )
-            search.run(request.work / FOUND_FOLDER)
+        with report_disk_full(request.work):
+            if request.lenses_of is not None:
+                write_per_view_principal_points(request, request.lenses_of, tell)
+            elif request.given is not None:
+                repair_misplaced(request, request.given, tell)
+            else:
+                search = PoseSearch(
+                    request.images, request.names, request.work, request.config, request.threads, tell
+                )
+                search.run(request.work / FOUND_FOLDER)
         write({"kind": "done"})
     except (DatasetError, DiskFullError) as error:
-        write({"kind": "error", "message": str(error)})
+        write({"kind": "error", "message": str(error), "is_disk_full": isinstance(error, DiskFullError)})
     except (RuntimeError, ValueError, OSError, MemoryError) as error:  # COLMAP's, by way of its binding
         text = " ".join(str(error).split())[:300].rstrip(".") or type(error).__name__
         message = f"COLMAP cannot find poses for {request.images} ({text}); look at the photographs."
         if request.lenses_of is not None:
             message = f"COLMAP cannot adjust the model in {request.lenses_of} ({text}); run COLMAP again."
-        write({"kind": "error", "message": message})
+        full = full_disk_error(request.work)
+        write({"kind": "error", "message": str(full or message), "is_disk_full": full is not None})
     # Not by way of the interpreter's clean-up, in which a library may hang or crash after all is done.
     os._exit(0)
 

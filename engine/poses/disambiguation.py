@@ -1,6 +1,5 @@
 """Models rebuilt without the false pairs of photographs that have joined parts of them wrongly."""
 
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,6 +20,7 @@ from octasplat.engine.poses.gps_contradictions import (
 )
 from octasplat.engine.poses.incremental_mapping import best_rank
 from octasplat.engine.poses.model_selection import distinct_models
+from octasplat.engine.poses.whole_files import copy_database
 
 MapPhotographs = Callable[[Path], list[Any]]
 """Returns the models that the matches of a database come to, that of most photographs first."""
@@ -206,8 +206,7 @@ def describe_gps_contradictions(mapped: MappedModels) -> list[str]:
 
 def _copy_without(database: Path, pairs: Int64[np.ndarray, "f 2"]) -> Path:
     """Return a copy of a database without some pairs, which come back if the trial is no better."""
-    trial = database.with_name("trial.db")
-    shutil.copyfile(database, trial)
+    trial = copy_database(database, database.with_name("trial.db"))
     remove_pairs(trial, pairs)
     return trial
 

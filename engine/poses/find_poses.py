@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from octasplat.engine.core.errors import CancelledError, ColmapCrashError, DatasetError
+from octasplat.engine.core.errors import CancelledError, ColmapCrashError, DatasetError, DiskFullError
 from octasplat.engine.core.events import (
     CheckpointWritten,
     Event,
@@ -25,7 +25,7 @@ from octasplat.engine.core.events import (
     parse_event,
 )
 from octasplat.engine.core.isolated_python import python_command
-from octasplat.engine.core.writing import write_json
+from octasplat.engine.core.writing import full_disk_error, write_json
 from octasplat.engine.poses.config import (
     DEFAULT_CONFIG,
     FEATURES,
@@ -93,6 +93,7 @@ def find_poses(
     Raises:
         DatasetError: too few photographs, or they do not fit together; the text says what to do. Also if the
             result that is there is of other photographs.
+        DiskFullError: the disk is full; the search goes on when there is space.
         ColmapCrashError: COLMAP died.
         CancelledError: stopped as asked.
     """
@@ -239,7 +240,8 @@ def _work_folder(
     Args:
         output: place of the result.
         search: what is searched for. The folder of the same search that was stopped is yielded as it was,
-            and a block that is stopped keeps it. None always begins with an empty folder.
+            and a block that is stopped, or finds the disk full, keeps it. None always begins with an empty
+            folder.
         progress: told why a search that was stopped begins anew.
     """
     work = search_folder(output)
@@ -251,7 +253,7 @@ def _work_folder(
     is_kept = False
     try:
         yield work
-    except (CancelledError, KeyboardInterrupt):
+    except (CancelledError, KeyboardInterrupt, DiskFullError):
         is_kept = search is not None
         raise
     finally:
@@ -277,7 +279,7 @@ class _ColmapProcess:
         self._last_progress: Event | None = None
         self._end: Event | None = None
         self._last_event_time = time.monotonic()
-        self._error: str | None = None
+        self._error: DatasetError | DiskFullError | None = None
         self._is_done = False
 
     def wait(self) -> None:
@@ -298,9 +300,10 @@ class _ColmapProcess:
                     self._handle_line(line)
             code = process.wait()
         if self._error is not None:
-            raise DatasetError(self._error)
+            raise self._error
         if not self._is_done:
-            raise ColmapCrashError(_crash_message(code, self.stage, log))
+            crash = ColmapCrashError(_crash_message(code, self.stage, log))
+            raise full_disk_error(self._request.work) or crash
 
     def tell_end(self) -> None:
         """Tell of the end of the last stage, once its result is where it belongs."""
@@ -329,7 +332,8 @@ class _ColmapProcess:
         if kind == "done":
             self._is_done = True
         elif kind == "error":
-            self._error = content["message"]
+            error = DiskFullError if content.get("is_disk_full") else DatasetError
+            self._error = error(content["message"])
         elif (event := parse_event(kind, content)) is not None:
             if isinstance(event, PhaseStarted):
                 self.tell_end()

@@ -31,6 +31,7 @@ from octasplat.engine.poses.pose_estimation import (
     estimate_pose,
     is_explained_by_pose,
 )
+from octasplat.engine.poses.whole_files import write_model
 from octasplat.engine.poses.workspace import link_photographs, progress_stage
 
 
@@ -65,7 +66,7 @@ def repair_misplaced(request: PoseSearchRequest, given: GivenModel, progress: Ev
     if moved:
         for k, pose in moved.items():
             _set_pose(hearing.model, hearing.images[k], pose)
-        hearing.model.write_binary(found)
+        write_model(hearing.model, found)
     write_json(found / RECORD_FILE, {"moved": [given.names[k] for k in sorted(moved)]})
 
 

@@ -21,6 +21,7 @@ from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset.colmap_reading import load_model
 from octasplat.engine.poses.config import FOUND_FOLDER, LENSES_STAGE, RECORD_FILE, PoseSearchRequest
 from octasplat.engine.poses.lens_check import MIN_OBSERVATIONS
+from octasplat.engine.poses.whole_files import write_model
 from octasplat.engine.poses.workspace import progress_stage
 
 MIN_GAIN = 0.15
@@ -59,7 +60,7 @@ def write_per_view_principal_points(
     if model is None or not after <= (1 - MIN_GAIN) * before:
         write_json(found / RECORD_FILE, {"lenses": None})
         return
-    model.write_binary(found)
+    write_model(model, found)
     shifts_px = [_shift_px(model, given, i) for i in sorted(model.images)]
     facts = {
         "reprojection_px_before": float(before),

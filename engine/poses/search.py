@@ -1,6 +1,5 @@
 """The search for poses, from photographs to a model that can be trusted; runs in a process of its own."""
 
-import shutil
 import sqlite3
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -39,16 +38,9 @@ from octasplat.engine.poses.features import (
 )
 from octasplat.engine.poses.found_models import write_other_models
 from octasplat.engine.poses.gps_contradictions import GroundPositions, read_ground_positions
-from octasplat.engine.poses.incremental_mapping import (
-    best_rank,
-    map_in_segments,
-    map_photographs,
-)
+from octasplat.engine.poses.incremental_mapping import best_rank, map_in_segments, map_photographs
 from octasplat.engine.poses.linking_pairs import NEIGHBORS_BY_NAME, propose_links
-from octasplat.engine.poses.model_selection import (
-    distinct_models,
-    model_facts,
-)
+from octasplat.engine.poses.model_selection import distinct_models, model_facts
 from octasplat.engine.poses.pairs import Pair, all_pairs, pair_count, pairs_with
 from octasplat.engine.poses.photograph_check import check_photographs_decode, read_image_infos
 from octasplat.engine.poses.search_check import check_mapped, search_rank
@@ -66,6 +58,7 @@ from octasplat.engine.poses.stored_search import (
     store_database,
     write_pairs,
 )
+from octasplat.engine.poses.whole_files import copy_database, write_model
 from octasplat.engine.poses.workspace import link_photographs, progress_stage
 
 MIN_RECOMMENDED_SIDE_PX = 480
@@ -147,8 +140,7 @@ class PoseSearch:
             for image in model.images.values():
                 image.name = names[image.name]
             folder = found / str(number) if number else found
-            folder.mkdir(exist_ok=True)
-            model.write_binary(folder)
+            write_model(model, folder)
             write_json(folder / RECORD_FILE, model_facts(model, self._all_names))
         write_other_models(found)
 
@@ -159,7 +151,7 @@ class PoseSearch:
         matched = self._match(database, thorough)
         count = len(self._names)
         # Mapping adds and removes matches: a search that is stopped in it goes on from what was matched.
-        database = Path(shutil.copyfile(database, self._work / "mapping.db"))
+        database = copy_database(database, self._work / "mapping.db")
         with progress_stage(MAPPING_STAGE, count, self._progress) as at:
             ground_m = read_ground_positions(database)
             # what is large takes too long to be mapped a second time
@@ -283,8 +275,7 @@ class PoseSearch:
         start = None
         if models:
             start = self._work / "start"
-            start.mkdir(exist_ok=True)
-            models[0].write_binary(start)
+            write_model(models[0], start)
         return register_without_pairs_against_gps(
             mapped,
             database,

@@ -4,7 +4,6 @@ Every mapping has a folder of its own, named by its number in the search. Its ``
 and names the folders of the models that count. One file holds all of them for another host.
 """
 
-import errno
 import json
 import shutil
 import tarfile
@@ -16,8 +15,9 @@ from typing import Any
 
 import pycolmap
 
-from octasplat.engine.core.writing import report_disk_full, write_json
+from octasplat.engine.core.writing import write_json
 from octasplat.engine.poses.stored_search import STORED_MAPPINGS
+from octasplat.engine.poses.whole_files import write_model
 
 MAPPINGS_FOLDER = "mappings"
 """In the folder for the work of the search."""
@@ -87,12 +87,7 @@ class StoredMapping:
     def _write_model(self, model: Any) -> Path:
         taken = {int(path.name) for path in self._folder.glob("[0-9]*")} if self._folder.is_dir() else set()
         folder = self._folder / str(max(taken, default=-1) + 1)
-        with report_disk_full(folder):
-            folder.mkdir(parents=True)
-            model.write_binary(folder)
-            # COLMAP does not notice a full disk.
-            if not _is_same(pycolmap.Reconstruction(folder), model):
-                raise OSError(errno.ENOSPC, "the model is cut short")
+        write_model(model, folder)
         return folder
 
 
@@ -100,8 +95,12 @@ def store_mappings(work: Path) -> Path:
     """Write the states of all mappings of a search into one file, and return it."""
     stored = work / STORED_MAPPINGS
     new = stored.with_suffix(".new")
-    with tarfile.open(new, "w") as archive:
-        archive.add(work / MAPPINGS_FOLDER, MAPPINGS_FOLDER)
+    try:
+        with tarfile.open(new, "w") as archive:
+            archive.add(work / MAPPINGS_FOLDER, MAPPINGS_FOLDER)
+    except OSError:
+        new.unlink(missing_ok=True)  # the search itself needs what room there is
+        raise
     return new.replace(stored)
 
 
@@ -117,15 +116,6 @@ def adopt_stored_mappings(work: Path) -> None:
             archive.extractall(trial, filter="data")
         (trial / MAPPINGS_FOLDER).rename(folder)
     shutil.rmtree(trial, ignore_errors=True)
-
-
-def _is_same(read: Any, written: Any) -> bool:
-    """Return whether two models have as many photographs, points and observations."""
-    sizes = [
-        (model.num_reg_images(), model.num_points3D(), model.compute_num_observations())
-        for model in (read, written)
-    ]
-    return sizes[0] == sizes[1]
 
 
 def _read_state(folder: Path) -> MappingState:

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,7 +10,7 @@ from typing import IO, Any
 
 import pytest
 
-from octasplat.engine.core.errors import CancelledError, ColmapCrashError
+from octasplat.engine.core.errors import CancelledError, ColmapCrashError, DiskFullError
 from octasplat.engine.core.events import Event, PhaseFinished, PhaseProgress, PhaseStarted, Warned
 from octasplat.engine.pipeline.output_folder import claim_output, release_on_refusal
 from octasplat.engine.poses import find_poses as module
@@ -22,14 +22,22 @@ from octasplat.engine.poses.config import (
     PoseSearchRequest,
 )
 from octasplat.engine.runs.config import ReconstructionConfig
+from tests.support.small_disk import small_disk
+
+DONE = {"kind": "done"}
 
 
-def lines_of(*events: Event) -> bytes:
-    lines = [json.dumps(event.as_dict()) for event in events]
-    return "\n".join([*lines, json.dumps({"kind": "done"}), ""]).encode()
+def lines_of(*events: Event, end: Mapping[str, object] = DONE) -> bytes:
+    lines = [event.as_dict() for event in events]
+    return "".join(json.dumps(line) + "\n" for line in [*lines, end]).encode()
 
 
-def fake_process(monkeypatch: pytest.MonkeyPatch, record: dict[str, Any], *events: Event) -> None:
+def fake_process(
+    monkeypatch: pytest.MonkeyPatch,
+    record: dict[str, Any],
+    *events: Event,
+    end: Mapping[str, object] = DONE,
+) -> None:
     """Let a process that tells these events leave a model with that record."""
 
     @contextmanager
@@ -37,7 +45,7 @@ def fake_process(monkeypatch: pytest.MonkeyPatch, record: dict[str, Any], *event
         (request.work / FOUND_FOLDER).mkdir()
         (request.work / FOUND_FOLDER / RECORD_FILE).write_text(json.dumps(record))
         read, write = os.pipe()
-        os.write(write, lines_of(*events))
+        os.write(write, lines_of(*events, end=end))
         os.close(write)
         with os.fdopen(read, "rb") as stdout:
             yield SimpleNamespace(stdout=stdout, wait=lambda: 0)
@@ -132,6 +140,26 @@ def test_long_steps_are_told_to_be_alive_wherever_they_are(
 def test_crash_names_what_was_done(tmp_path: Path, stage: str, doing: str) -> None:
     message = module._crash_message(-9, stage, tmp_path / "log.txt")
     assert message.startswith(f"COLMAP was ended by SIGKILL while {doing}")
+
+
+def test_search_on_a_full_disk_goes_on_when_there_is_space(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "a.png").write_bytes(b"a photograph")
+    full = {"kind": "error", "message": "No space left.", "is_disk_full": True}
+    fake_process(monkeypatch, {"placed": 1}, end=full)
+    with pytest.raises(DiskFullError, match="No space left"):
+        find(tmp_path, tmp_path / "poses", lambda _event: None)
+    assert (tmp_path / ".poses.work" / "search.json").exists()
+
+
+def test_crash_on_a_full_disk_is_put_down_to_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.png").write_bytes(b"a photograph")
+    fake_process(monkeypatch, {"placed": 1}, end={"kind": "stage_started", "stage": "features"})
+    with small_disk(tmp_path / "disk", 1) as disk:
+        with pytest.raises(DiskFullError, match="free space there"):
+            find(tmp_path, disk / "poses", lambda _event: None)
+        assert (disk / ".poses.work" / "search.json").exists()
 
 
 def test_same_command_goes_after_a_crash(tmp_path: Path) -> None:

@@ -1,6 +1,9 @@
 """Two walks along walls that look alike, taken for one: GPS tells false pairs, and others map it anew."""
 
+import shutil
+import sqlite3
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -227,6 +230,27 @@ def test_models_that_agree_better_with_gps_are_taken(street: Street, tmp_path: P
         assert mapped.models == [street.folded] and mapped.left_out_pairs == 0
         assert "displaced against each other (photographs there are 7." in sentences
         assert pairs_of(database) == pairs_of(street.database)
+
+
+def test_trial_has_no_changes_of_one_that_was_killed(street: Street, tmp_path: Path) -> None:
+    database, ground_m = copied(street, tmp_path), read_ground_positions(street.database)
+    found = find_gps_contradictions([street.folded], database, ground_m)
+    (tmp_path / "killed").mkdir()
+    killed = Path(shutil.copyfile(database, tmp_path / "killed" / "trial.db"))
+    with closing(sqlite3.connect(killed)) as left_open:  # its changes are in a file beside it
+        left_open.execute("DELETE FROM two_view_geometries")
+        left_open.commit()
+        for path in killed.parent.iterdir():
+            shutil.copyfile(path, tmp_path / path.name)
+    assert (tmp_path / "trial.db-wal").stat().st_size > 0
+    pairs: list[int] = []
+
+    def map_again(trial: Path) -> list[Any]:
+        pairs.append(pairs_of(trial))
+        return [street.whole]
+
+    leave_out_pairs_against_gps(MappedModels([street.folded]), database, ground_m, map_again)
+    assert pairs == [pairs_of(street.database) - len(found.pairs)]
 
 
 def test_right_model_is_mapped_once(street: Street) -> None:

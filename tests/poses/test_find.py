@@ -3,9 +3,11 @@
 import json
 import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -327,6 +329,31 @@ def test_large_capture_that_is_stopped_while_it_is_mapped_gives_the_same_bytes(
         for folder in (tmp_path / "at_once", work)
     )
     assert once == stopped and "images.bin" in once
+
+
+@pytest.mark.exhaustive
+def test_search_that_was_killed_while_it_changed_matches_gives_the_same_bytes(
+    taken: Photographs, found_at_once: Found, tmp_path: Path
+) -> None:
+    names = tuple(sorted(taken.centres_world))
+
+    def kill(event: Event) -> None:
+        if isinstance(event, PhaseStarted) and event.stage == "poses":
+            raise _KilledError
+
+    with pytest.raises(_KilledError):
+        PoseSearch(taken.folder, names, tmp_path, PosesConfig(), 1, kill).run(tmp_path / "found")
+    killed = tmp_path / "killed"
+    killed.mkdir()
+    shutil.copyfile(tmp_path / "database.db", killed / "mapping.db")
+    with closing(sqlite3.connect(killed / "mapping.db")) as left_open:  # its changes are in a file beside it
+        left_open.execute("UPDATE two_view_geometries SET rows = 0, data = NULL WHERE pair_id % 2 = 0")
+        left_open.commit()
+        for path in killed.iterdir():
+            shutil.copyfile(path, tmp_path / path.name)
+    PoseSearch(taken.folder, names, tmp_path, PosesConfig(), 1, lambda _event: None).run(tmp_path / "found")
+    for path in found_at_once.model.glob("*.bin"):
+        assert (tmp_path / "found" / path.name).read_bytes() == path.read_bytes()
 
 
 @pytest.mark.exhaustive

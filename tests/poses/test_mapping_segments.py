@@ -8,6 +8,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from octasplat.engine.core.errors import DiskFullError
 from octasplat.engine.poses import incremental_mapping
 from octasplat.engine.poses.incremental_mapping import map_in_segments, map_photographs
 from octasplat.engine.poses.stored_mappings import (
@@ -17,6 +18,7 @@ from octasplat.engine.poses.stored_mappings import (
     store_mappings,
 )
 from octasplat.engine.poses.stored_search import STORED_MAPPINGS
+from tests.support.small_disk import files_no_larger_than
 
 PHOTOGRAPHS = 24
 
@@ -156,3 +158,19 @@ def test_states_that_are_cut_short_are_not_taken(tmp_path: Path) -> None:
     folder.mkdir(parents=True)
     (folder / "state.json").write_text('{"finished": ["0"], "curr')
     assert not StoredMapping(folder, ignore_count).state.is_done
+
+
+@pytest.mark.parametrize("limit_bytes", [60, 1_000, 10_000, 100_000])
+def test_full_disk_leaves_the_last_state(two_places: Path, tmp_path: Path, limit_bytes: int) -> None:
+    """COLMAP does not tell of it, and never comes to the end of some files that are cut short."""
+    model, other = map_photographs(two_places, seed=0, on_count=ignore_count)
+    folder = tmp_path / MAPPINGS_FOLDER / "0"
+    StoredMapping(folder, ignore_count).write([], other, is_done=False)
+    with files_no_larger_than(limit_bytes), pytest.raises(DiskFullError, match="free space there"):
+        StoredMapping(folder, ignore_count).write([], model, is_done=False)
+    state = StoredMapping(folder, ignore_count).state
+    assert state.current == folder / "0" and state.current.is_dir()
+    assert not (folder / "1").exists()
+    with files_no_larger_than(limit_bytes), pytest.raises(OSError, match="File too large"):
+        store_mappings(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == [MAPPINGS_FOLDER]
