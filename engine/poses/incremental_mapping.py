@@ -158,14 +158,15 @@ def _run_mapper(
         pipeline = pycolmap.IncrementalPipeline(options, source, manager)
     begun = manager.get(0).num_reg_frames() if manager.size() else 0
     adjusted = (begun, manager.get(0).num_points3D()) if begun else (0, 0)
-    segment_end = max(_SEGMENT_GROWTH * begun, _MIN_SEGMENT)
+    segment_end: float = max(_SEGMENT_GROWTH * begun, _MIN_SEGMENT)
     count.begin(begun)
 
     def first_pair() -> None:
-        nonlocal adjusted
+        nonlocal adjusted, segment_end
         model = manager.get(manager.size() - 1)
         adjusted = model.num_reg_frames(), model.num_points3D()
-        count.begin(adjusted[0])  # a new model: its photographs are counted anew
+        segment_end = _MIN_SEGMENT  # a new model: its photographs are counted anew
+        count.begin(adjusted[0])
 
     def another() -> None:
         nonlocal adjusted
