@@ -48,6 +48,7 @@ from octasplat.engine.poses.stored_mappings import (
     MAPPINGS_FOLDER,
     StoredMapping,
     adopt_stored_mappings,
+    matches_digest,
     store_mappings,
 )
 from octasplat.engine.poses.stored_search import (
@@ -301,7 +302,7 @@ class PoseSearch:
         self._mappings += 1
         return map_in_segments(
             database,
-            StoredMapping(folder, self._tell_stored_mapping),
+            StoredMapping(folder, matches_digest(database), self._tell_stored_mapping),
             seed=seed,
             on_count=at,
             allow_weak_links=allow_weak_links,

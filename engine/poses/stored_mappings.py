@@ -4,12 +4,14 @@ Every mapping has a folder of its own, named by its number in the search. Its ``
 and names the folders of the models that count. One file holds all of them for another host.
 """
 
+import hashlib
 import json
 import shutil
+import sqlite3
 import tarfile
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from contextlib import closing, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -43,18 +45,19 @@ class StoredMapping:
     """Writes the models of one mapping and its state.
 
     Args:
-        folder: of the mapping.
-        on_stored: called after each written state, with the number of photographs of the model that grows,
-            or of the largest one where all are complete.
+        folder: of the mapping. A state of other matches that lies there is not taken.
+        matches: digest of those that are mapped, see :func:`matches_digest`.
+        on_stored: called after each written state, with the number of photographs of the model that grew.
 
     Attributes:
         state: the newest.
     """
 
-    def __init__(self, folder: Path, on_stored: Callable[[int], None]) -> None:
+    def __init__(self, folder: Path, matches: str, on_stored: Callable[[int], None]) -> None:
         self._folder = folder
+        self._matches = matches
         self._on_stored = on_stored
-        self.state = _read_state(folder)
+        self.state = _read_state(folder, matches)
 
     def write(self, finished: Sequence[Any], current: Any | None, *, is_done: bool) -> None:
         """Write a state, and remove the former model that grew.
@@ -70,6 +73,7 @@ class StoredMapping:
             tuple(folders), None if current is None else self._write_model(current), is_done
         )
         names = {
+            "matches": self._matches,
             "finished": [path.name for path in self.state.finished],
             "current": None if self.state.current is None else self.state.current.name,
             "is_done": is_done,
@@ -89,6 +93,18 @@ class StoredMapping:
         folder = self._folder / str(max(taken, default=-1) + 1)
         write_model(model, folder)
         return folder
+
+
+def matches_digest(database: Path) -> str:
+    """Return what tells the features and matches of a database from others: how many there are of each."""
+    digest = hashlib.sha256()
+    with closing(sqlite3.connect(database)) as source:
+        for query in (
+            "SELECT image_id, rows FROM keypoints ORDER BY image_id",
+            "SELECT pair_id, rows FROM two_view_geometries ORDER BY pair_id",
+        ):
+            digest.update(repr(source.execute(query).fetchall()).encode())
+    return digest.hexdigest()
 
 
 def store_mappings(work: Path) -> Path:
@@ -118,16 +134,16 @@ def adopt_stored_mappings(work: Path) -> None:
     shutil.rmtree(trial, ignore_errors=True)
 
 
-def _read_state(folder: Path) -> MappingState:
-    """Return the state in a folder, and remove the models that it does not name."""
+def _read_state(folder: Path, matches: str) -> MappingState:
+    """Return the state of a mapping of these matches, and remove the models that it does not name."""
     state = MappingState()
-    try:
+    with suppress(OSError, ValueError, KeyError, TypeError):
         names = json.loads((folder / _STATE_FILE).read_text(encoding="utf-8"))
-        finished, current = tuple(folder / name for name in names["finished"]), names["current"]
-        state = replace(state, finished=finished, is_done=bool(names["is_done"]))
-        state = replace(state, current=None if current is None else folder / current)
-    except (OSError, ValueError, KeyError, TypeError):
-        pass
+        if names["matches"] == matches:
+            finished, current = tuple(folder / name for name in names["finished"]), names["current"]
+            state = MappingState(
+                finished, None if current is None else folder / current, bool(names["is_done"])
+            )
     for path in folder.glob("[0-9]*"):
         if path not in (*state.finished, state.current):
             shutil.rmtree(path, ignore_errors=True)
