@@ -76,7 +76,8 @@ def find_poses(
     no ``read``, but for photographs in formats that COLMAP does not read, which are counted first. The same
     photographs give the same files on any number of threads. A result that is there already is taken as it
     is. A search that was stopped goes on with the features and matches that it had found, unless it was
-    begun by a version with other results, of which a warning tells.
+    begun by a version with other results, of which a warning tells; so does one of 100 photographs and more
+    in which COLMAP died, as for want of memory.
 
     Args:
         images: folder of photographs, also in folders below it if it is called ``images``.
@@ -107,7 +108,8 @@ def find_poses(
                 f"the results, or remove {output} to find them anew."
             )
         return
-    with _work_folder(output, search_record(sha256, config), progress) as work:
+    is_long = len(names) >= STORED_FROM
+    with _work_folder(output, search_record(sha256, config), progress, keeps_after_crash=is_long) as work:
         request = PoseSearchRequest(
             images=images.resolve(), names=tuple(names), work=work.resolve(), config=config, threads=threads
         )
@@ -115,7 +117,7 @@ def find_poses(
         try:
             process.wait()
         except CancelledError:
-            is_kept = process.stage in (FEATURES, MATCHES) and len(names) >= STORED_FROM
+            is_kept = process.stage in (FEATURES, MATCHES) and is_long
             if is_kept and (stored := store_stopped_search(work)) is not None:
                 progress(CheckpointWritten(process.step, str(stored)))
             raise
@@ -233,7 +235,11 @@ def adjust_principal_points(
 
 @contextmanager
 def _work_folder(
-    output: Path, search: Mapping[str, Any] | None = None, progress: EventListener = ignore_events
+    output: Path,
+    search: Mapping[str, Any] | None = None,
+    progress: EventListener = ignore_events,
+    *,
+    keeps_after_crash: bool = False,
 ) -> Iterator[Path]:
     """Yield a hidden folder beside ``output``, removed when the block ends.
 
@@ -243,6 +249,7 @@ def _work_folder(
             and a block that is stopped, or finds the disk full, keeps it. None always begins with an empty
             folder.
         progress: told why a search that was stopped begins anew.
+        keeps_after_crash: whether a search in which COLMAP dies keeps it, too.
     """
     work = search_folder(output)
     if search is None or not is_stopped_search(work, search, progress):
@@ -255,6 +262,9 @@ def _work_folder(
         yield work
     except (CancelledError, KeyboardInterrupt, DiskFullError):
         is_kept = search is not None
+        raise
+    except ColmapCrashError:
+        is_kept = keeps_after_crash
         raise
     finally:
         if not is_kept:

@@ -162,6 +162,18 @@ def test_crash_on_a_full_disk_is_put_down_to_it(tmp_path: Path, monkeypatch: pyt
         assert (disk / ".poses.work" / "search.json").exists()
 
 
+@pytest.mark.parametrize(("kept_from", "is_kept"), [(1, True), (2, False)])
+def test_what_a_long_search_has_found_stays_after_a_crash(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept_from: int, is_kept: bool
+) -> None:
+    (tmp_path / "a.png").write_bytes(b"a photograph")
+    monkeypatch.setattr(module, "STORED_FROM", kept_from)
+    fake_process(monkeypatch, {"placed": 1}, end={"kind": "stage_started", "stage": "poses"})
+    with pytest.raises(ColmapCrashError):
+        find(tmp_path, tmp_path / "poses", lambda _event: None)
+    assert (tmp_path / ".poses.work" / "search.json").exists() == is_kept
+
+
 def test_same_command_goes_after_a_crash(tmp_path: Path) -> None:
     output = tmp_path / "out"
     for _ in range(2):
