@@ -146,6 +146,8 @@ async def retry_job(
 
         async def make() -> uuid.UUID:
             await lock_owner(connection, owner)
+            # Before the job that waited for them, see workers.db.locks.
+            await rows.lock_blocks(connection, job_id)
             job = await fetch_visible_job(connection, principal, job_id, lock=True)
             await check_new_job(connection, owner, service.settings.quota)
             revised = await _revised_options(connection, service, principal, job, request)
