@@ -2,6 +2,7 @@
 
 import asyncio
 import uuid
+from weakref import WeakValueDictionary
 
 from pydantic import BaseModel
 
@@ -17,6 +18,8 @@ from octasplat.workers.worker.job_kinds import JobKind
 
 WAIT_SECONDS = 40.0
 """After which the job checks its meshes: an answer does not wait for many other checks."""
+_CHECKS_OF_OWNERS: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
+"""Held by the one check of an owner that is under way, so that one owner does not take all threads."""
 
 
 async def check_glass_meshes(
@@ -47,8 +50,9 @@ async def check_glass_meshes(
     files = [TreeFile(path=row.path, sha256=row.sha256, size_bytes=row.size_bytes) for row in rows]
     if not {mesh.file for mesh in meshes.values()} <= {file.path for file in files}:
         return
+    turn = _CHECKS_OF_OWNERS.setdefault(principal.owner, asyncio.Lock())
     try:
-        async with asyncio.timeout(WAIT_SECONDS):
+        async with asyncio.timeout(WAIT_SECONDS), turn:
             faults = await run_in_pool(
                 ThreadPurpose.MESHES,
                 find_open_glass, service.storage, meshes, files, service.settings.mesh_limits(),

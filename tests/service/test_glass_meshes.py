@@ -112,19 +112,43 @@ async def test_others_are_answered_while_meshes_are_checked(
 
     def run_late(*given: Any) -> Any:
         is_begun.set()
-        assert may_end.wait(60)
+        assert may_end.wait(300)
         return run_parser(*given)
 
     monkeypatch.setattr(mesh_check, "run_parser", run_late)
     async with connect_service() as (http, service):
         body = await render_of(http, service, {"leaf.obj": LEAF})
         asked = asyncio.create_task(http.post("/v1/jobs", json=staged(body, "leaf.obj")))
-        assert await asyncio.to_thread(is_begun.wait, 60)
+        assert await asyncio.to_thread(is_begun.wait, 300)
         # Of the same owner, whose lock the check does not hold.
         other = await http.post("/v1/jobs", json={**body, "options": {"stage": "[[meshes]]\nshape = 'cube'"}})
         assert other.status_code == 202 and not asked.done()
         may_end.set()
         assert (await asked).status_code == 422
+
+
+async def test_checks_of_one_owner_follow_each_other(
+    connect_service: ConnectService, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    is_begun, may_end = threading.Event(), threading.Event()
+    run_parser = mesh_check.run_parser
+
+    def run_late(*given: Any) -> Any:
+        if not is_begun.is_set():  # the first one
+            is_begun.set()
+            assert may_end.wait(300)
+        return run_parser(*given)
+
+    monkeypatch.setattr(mesh_check, "run_parser", run_late)
+    async with connect_service() as (http, service):
+        body = staged(await render_of(http, service, {"leaf.obj": LEAF}), "leaf.obj")
+        asked = [asyncio.create_task(http.post("/v1/jobs", json=body)) for _ in range(3)]
+        assert await asyncio.to_thread(is_begun.wait, 300)
+        other = await client_with_token(service, "eve", "admin")
+        refused = await http.post("/v1/jobs", json=body, headers=other)
+        assert refused.status_code == 422 and not any(task.done() for task in asked)
+        may_end.set()
+        assert {(await task).status_code for task in asked} == {422}
 
 
 async def test_retries_with_open_glass_are_refused(
