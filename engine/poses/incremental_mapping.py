@@ -21,8 +21,10 @@ _LARGE_REFINEMENTS = 2
 """Adjustments in a row at most, instead of 5."""
 _LARGE_ADJUSTMENT_STEPS = 20
 """Iterations of each, instead of 50."""
-_LARGE_TOLERANCE = 1e-5
-"""Relative fall of the cost at which one ends."""
+_LARGE_TOLERANCE = 1e-4
+"""Relative fall of the cost at which one ends while a model grows ..."""
+_COMPLETE_TOLERANCE = 1e-5
+"""... and at which the last one of a complete model does, or one of a few photographs."""
 _MIN_SEGMENT = 250
 """Photographs of the first segment at least ..."""
 _SEGMENT_GROWTH = 1.2
@@ -96,7 +98,8 @@ def map_in_segments(
     options.ba_global_frames_ratio = options.ba_global_points_ratio = _LARGE_GROWTH
     options.ba_global_max_refinements = _LARGE_REFINEMENTS
     options.ba_global_max_num_iterations = _LARGE_ADJUSTMENT_STEPS
-    options.ba_global_function_tolerance = options.ba_local_function_tolerance = _LARGE_TOLERANCE
+    options.ba_global_function_tolerance = _LARGE_TOLERANCE
+    options.ba_local_function_tolerance = _COMPLETE_TOLERANCE
     count = _Count(on_count)
     while not stored.state.is_done:
         _map_segment(options, database, stored, start, count)
@@ -187,7 +190,26 @@ def _run_mapper(
         pipeline.run()
     except _SegmentEndError:
         return True
+    if ends_segments:
+        for model in _all_models(manager):
+            _adjust_complete(model, pipeline.database_cache, options)
     return False
+
+
+def _adjust_complete(model: Any, matches: Any, options: Any) -> None:
+    """Adjust all photographs of a complete model until the cost hardly falls any more."""
+    adjustment = options.get_global_bundle_adjustment()
+    adjustment.ceres.solver_options.function_tolerance = _COMPLETE_TOLERANCE
+    mapper = pycolmap.IncrementalMapper(matches)
+    mapper.begin_reconstruction(model)
+    mapper.iterative_global_refinement(
+        options.ba_global_max_refinements,
+        options.ba_global_max_refinement_change,
+        options.get_mapper(),
+        adjustment,
+        options.get_triangulation(),
+    )
+    mapper.end_reconstruction(False)
 
 
 class _Count:
