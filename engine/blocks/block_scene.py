@@ -32,7 +32,7 @@ from octasplat.engine.blocks.scene_plan import (
     ScenePlan,
     block_name,
     has_plan,
-    load_plan,
+    load_plan_to_train,
     save_plan,
 )
 from octasplat.engine.core.events import Noted
@@ -68,6 +68,7 @@ def train_in_blocks(
 
     Raises:
         ConfigError: the scene cannot be cut into so many.
+        CheckpointError: the plan that is there is damaged, or of a version with other results.
         TrainingError: a training collapsed.
         CancelledError: stopped as asked.
     """
@@ -95,9 +96,12 @@ def plan_scene(
         open_coarse: likewise.
         tell: tells the progress.
         most_gaussians: see :func:`train_in_blocks`.
+
+    Raises:
+        CheckpointError: the plan that is there is damaged, or of a version with other results.
     """
     if has_plan(work.folder):
-        return load_plan(work.folder)
+        return load_plan_to_train(work.folder)
     tell.expect(_guess_iterations(work, count, most_gaussians))
     coarse = _train_coarse(work, tell, open_coarse).gaussians
     blocks = plan_blocks(

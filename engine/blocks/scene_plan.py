@@ -1,13 +1,14 @@
 """The plan of a scene in blocks: what each trains and for how long, in one file beside the pieces."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from octasplat.engine.blocks.block_plan import Block
 from octasplat.engine.blocks.partition import Box
+from octasplat.engine.core import versions
 from octasplat.engine.core.errors import CheckpointError
 from octasplat.engine.core.writing import atomic_replace
 from octasplat.engine.dataset.view_tiles import Rectangles
@@ -15,6 +16,8 @@ from octasplat.engine.train.loop.checkpoint import ARCHIVE_DAMAGE
 
 PLAN_FILE = "plan.npz"
 COARSE, POLISH, FINISH = "coarse", "polish", "finish"
+_UNSTATED_RESULTS = 10
+"""Results version of plans that do not state theirs, as those before did not."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +32,7 @@ class ScenePlan:
         most_gaussians: of any block; None for no such limit.
         is_finished_together: whether one training holds all blocks in the end, see
             :func:`octasplat.engine.blocks.piece_settings.fits_together`.
+        results: :data:`octasplat.engine.core.versions.RESULTS_VERSION` of the version that made it.
     """
 
     blocks: tuple[Block, ...]
@@ -37,6 +41,7 @@ class ScenePlan:
     last_iterations: int
     most_gaussians: int | None
     is_finished_together: bool
+    results: int = field(default_factory=lambda: versions.RESULTS_VERSION)
 
     @property
     def last_piece(self) -> str:
@@ -83,6 +88,7 @@ def save_plan(plan: ScenePlan, folder: Path) -> None:
         "corner_px": np.concatenate([found.corner_px for found in pixels]),
         "size_px": np.concatenate([found.size_px for found in pixels]),
         "frequency": np.concatenate([found.frequency for found in pixels]),
+        "results": np.array(plan.results, np.int64),
         "scene": np.array(
             [
                 plan.coarse_iterations,
@@ -95,6 +101,21 @@ def save_plan(plan: ScenePlan, folder: Path) -> None:
     }
     with atomic_replace(folder / PLAN_FILE) as temporary:
         np.savez(temporary, **arrays)  # type: ignore[arg-type]
+
+
+def load_plan_to_train(folder: Path) -> ScenePlan:
+    """Read the plan of blocks that are to be trained.
+
+    Raises:
+        CheckpointError: the file is missing or damaged, or of a version with other results.
+    """
+    plan = load_plan(folder)
+    if plan.results != versions.RESULTS_VERSION:
+        raise CheckpointError(
+            f"The blocks in {folder} were planned by a version in which the same settings gave other "
+            "results; go on with that version, or train again in another folder."
+        )
+    return plan
 
 
 def load_plan(folder: Path) -> ScenePlan:
@@ -118,8 +139,9 @@ def load_plan(folder: Path) -> ScenePlan:
             )
         )  # fmt: skip
         coarse, last, most, together = found["scene"].tolist()
+        results = int(found["results"]) if "results" in found else _UNSTATED_RESULTS
         return ScenePlan(
-            blocks, tuple(found["iterations"].tolist()), coarse, last, most or None, bool(together)
+            blocks, tuple(found["iterations"].tolist()), coarse, last, most or None, bool(together), results
         )
     except (*ARCHIVE_DAMAGE, IndexError) as error:
         raise CheckpointError(f"{path} cannot be read ({error}); train again without --resume.") from None

@@ -1,4 +1,4 @@
-"""Atomic writing of files, with errors of a full disk that name the file."""
+"""Atomic writing of files and exchange of folders, with errors of a full disk that name the file."""
 
 import errno
 import json
@@ -72,3 +72,28 @@ def write_text(path: Path, text: str) -> None:
 def write_json(path: Path, value: object) -> None:
     """Write ``value`` as indented JSON to ``path``, atomically."""
     write_text(path, json.dumps(value, indent=2) + "\n")
+
+
+def replace_folder(folder: Path, new: Path) -> None:
+    """Put ``new`` in the place of ``folder``, if that is there, and remove the former one.
+
+    For a process that is killed meanwhile see :func:`restore_folder`.
+    """
+    former = _former_folder(folder)
+    shutil.rmtree(former, ignore_errors=True)
+    if folder.is_dir():  # no system function exchanges two folders everywhere
+        folder.rename(former)
+    new.rename(folder)
+    shutil.rmtree(former, ignore_errors=True)
+
+
+def restore_folder(folder: Path) -> None:
+    """Put the former folder back where :func:`replace_folder` was killed before the new one was there."""
+    former = _former_folder(folder)
+    if former.is_dir() and not folder.exists():
+        former.rename(folder)
+    shutil.rmtree(former, ignore_errors=True)
+
+
+def _former_folder(folder: Path) -> Path:
+    return folder.with_name(f".{folder.name}.former")

@@ -22,7 +22,7 @@ from octasplat.engine.files.encodings import (
     turn_cloud,
 )
 from octasplat.engine.files.glb_container import GlbFile
-from octasplat.engine.files.khr_glb import COMPRESSION, EXTENSION
+from octasplat.engine.files.khr_glb import COLOR_SPACE, COMPRESSION, EXTENSION
 from octasplat.engine.files.octagon_glb_reader import octagon_q, read_octagons
 from octasplat.engine.files.registry import Importer, register
 from octasplat.engine.files.spz import decode
@@ -32,6 +32,7 @@ from octasplat.engine.gaussians.flattening import CloudBlocks, GaussianCloud, jo
 from octasplat.engine.gaussians.model import SH_C0
 from octasplat.engine.gaussians.rows import RowIndex
 
+KERNEL, LINEAR_COLOR_SPACE = "ellipse", "lin_rec709_display"
 SIMILARITY_TOLERANCE = 1e-4
 """Relative error up to which a node may fail to be a rotation with one scale."""
 
@@ -135,7 +136,7 @@ class _Splats:
             channels: accessors of each channel that is wanted.
 
         Raises:
-            SceneFileError: an extension is needed that is not read.
+            SceneFileError: an extension or a kernel is needed that is not read.
         """
         self._path, self._file, self._attributes, self._matrix = path, file, attributes, matrix
         self._channels = channels
@@ -148,8 +149,12 @@ class _Splats:
         further = splats.get("extensions", {})
         if unknown := ", ".join(name for name in further if name != COMPRESSION):
             raise SceneFileError(f"{path}: its splats need {unknown}, which is not read.")
+        if (kernel := splats.get("kernel", KERNEL)) != KERNEL:  # drafts of the extension had none
+            raise SceneFileError(f"{path}: its splats have the kernel {kernel}, which is not read.")
         self._packed: SpzSource | None = None
-        self._is_linear = splats.get("colorSpace") == "lin_rec709_display"
+        color_space = splats.get("colorSpace", COLOR_SPACE)
+        self._is_linear = color_space == LINEAR_COLOR_SPACE
+        self._color_notes = _color_notes(color_space)
         self._notes = (
             *glb_parts.part_note(file.document),
             *dropped_sh_message(_sh_degree_of(attributes)),
@@ -157,14 +162,12 @@ class _Splats:
         if further:
             self._packed = parse_spz(path, file.view_bytes(further[COMPRESSION]["bufferView"]))
             self.count = self._packed.count
-            self.coefficients = (min(self._packed.header.sh_degree, MAX_SH_DEGREE) + 1) ** 2
+            coefficients = (min(self._packed.header.sh_degree, MAX_SH_DEGREE) + 1) ** 2
         else:
             self._harmonics = _harmonic_accessors(attributes)
-            if self._is_linear:
-                message = "Its colors are linear; they were converted, without what depends on the view."
-                self._notes = (message, *self._notes)
             self.count = file.count(attributes["POSITION"])
-            self.coefficients = 1 if self._is_linear else len(self._harmonics)
+            coefficients = len(self._harmonics)
+        self.coefficients = 1 if self._is_linear else coefficients
         if any(file.count(number) != self.count for number in self._accessors()):
             raise ValueError("its attributes differ in length")
 
@@ -185,6 +188,9 @@ class _Splats:
             found = ((rows, self._read_rows(rows)) for rows in row_slices(self.count))
         for rows, cloud in found:
             assert isinstance(rows, slice)
+            if self._is_linear:
+                cloud = replace(cloud, sh=sh0_from_rgb(linear_to_srgb(0.5 + SH_C0 * cloud.sh[:, 0])))
+            cloud = replace(cloud, notes=(*self._color_notes, *cloud.notes))
             named = {
                 name: np.concatenate([self._file.array(k, np.float32, rows) for k in own], axis=1)
                 for name, own in self._channels.items()
@@ -200,8 +206,6 @@ class _Splats:
 
         xyzw = read(f"{EXTENSION}:ROTATION")
         sh = np.stack([self._file.array(k, np.float32, rows) for k in self._harmonics], axis=1)
-        if self._is_linear:
-            sh = sh0_from_rgb(linear_to_srgb(0.5 + SH_C0 * sh[:, 0]))
         # Opacities of 0 and 1 have infinite logits, which flatten() replaces.
         with np.errstate(divide="ignore", invalid="ignore"):
             opacity = read(f"{EXTENSION}:OPACITY")[:, 0].astype(np.float64)
@@ -215,6 +219,15 @@ class _Splats:
             sh=sh,
             notes=self._notes,
         )
+
+
+def _color_notes(color_space: object) -> tuple[str, ...]:
+    """Return what to tell of the color space that a file states; nothing of the usual one."""
+    if color_space == LINEAR_COLOR_SPACE:
+        return ("Its colors are linear; they were converted, without what depends on the view.",)
+    if color_space != COLOR_SPACE:  # as in drafts of the extension
+        return (f"Its color space {color_space} is not known; its colors were taken for {COLOR_SPACE}.",)
+    return ()
 
 
 def _sh_degree_of(attributes: dict[str, int]) -> int:

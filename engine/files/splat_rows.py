@@ -8,10 +8,7 @@ import numpy as np
 from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.gaussians.flattening import row_slices, select_gaussians
-from octasplat.engine.gaussians.model import FlatGaussians
-
-# A little less than the largest, whose power may be rounded to infinity
-MAX_LOG_SCALE = float(np.log(np.finfo(np.float32).max)) - 1e-3
+from octasplat.engine.gaussians.model import MAX_LOG_SCALE, FlatGaussians
 
 
 def select_for_export(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> FlatGaussians:

@@ -22,7 +22,7 @@ from octasplat.engine.files.folders_of_parts import former_folders, move_into_pl
 from octasplat.engine.files.kd_cells import halve_points
 from octasplat.engine.files.range_losses import find_position_losses
 from octasplat.engine.files.registry import Exporter, register
-from octasplat.engine.files.splat_rows import iterate_blocks, select_for_export
+from octasplat.engine.files.splat_rows import check_scales, iterate_blocks, select_for_export
 from octasplat.engine.files.spz import find_range_losses, least_step
 from octasplat.engine.files.tile_tree import TileContent, tileset_json
 from octasplat.engine.gaussians.levels_of_detail import iterate_levels, level_counts
@@ -44,11 +44,12 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     """Write the index and, in a folder beside it, the tiles; returns the index first.
 
     Raises:
-        SceneFileError: nothing to write, values that are not finite, positions too far apart, or files that
-            are no tiles are in the way.
+        SceneFileError: nothing to write, values that are not finite, sizes beyond float32, positions too far
+            apart, or files that are no tiles are in the way.
         OSError: a file cannot be written.
     """
     scene = select_for_export(gaussians, path, options)
+    check_scales(scene, path)
     former = former_folders(path, _content_folders(path), _are_tiles)
     depth = len(level_counts(len(scene), FEWEST_IN_ROOT)) - 1
     cells = halve_points(scene.means_world, depth)

@@ -21,6 +21,9 @@ from octasplat.engine.gaussians.rows import (
 FLAT_SCALE = 1e-5
 """Standard deviation along the normal, s1 = eps of the paper, in world units."""
 
+MAX_LOG_SCALE = float(np.log(np.finfo(np.float32).max)) - 1e-3
+"""A little less than that of the largest standard deviation, whose power may be rounded to infinity."""
+
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic."""
 

@@ -17,7 +17,7 @@ from octasplat.engine.gaussians.materials import (
     MATERIAL_WIDTHS,
     is_material_known,
 )
-from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
+from octasplat.engine.gaussians.model import MAX_LOG_SCALE, SH_C0, FlatGaussians
 
 COLOR_WEIGHT = 20.0
 """Weight of a squared difference of colors against a relative growth of the area."""
@@ -62,7 +62,9 @@ class _Moments:
     """Masses, means, covariances and colors of Gaussians, and what merging pairs of them costs."""
 
     def __init__(self, gaussians: FlatGaussians) -> None:
-        scales = np.maximum(gaussians.scales.astype(np.float64), MIN_SCALE)
+        # larger ones count as the largest that float32 holds
+        scales = np.exp(np.minimum(gaussians.log_scales, np.float32(MAX_LOG_SCALE)))
+        scales = np.maximum(scales.astype(np.float64), MIN_SCALE)
         axes = gaussians.rotations[:, :, 1:].astype(np.float64) * scales[:, None, :]
         self.areas = scales.prod(axis=1)
         self.masses = np.maximum(gaussians.opacities.astype(np.float64), 1e-6) * self.areas
@@ -143,7 +145,7 @@ def _merge(
     return FlatGaussians(
         means_world=mean.astype(np.float32),
         quats_wxyz=quaternions_from_matrices(frames).astype(np.float32),
-        log_scales=np.log(scales).astype(np.float32),
+        log_scales=np.minimum(np.log(scales), MAX_LOG_SCALE).astype(np.float32),
         opacity_logits=np.log(opacity / (1 - opacity)).astype(np.float32),
         sh=_mean(gaussians.sh, first, second, share[:, :, None]).astype(np.float32),
         channels=_merged_channels(gaussians, first, second, share),

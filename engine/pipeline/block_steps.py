@@ -15,7 +15,14 @@ from octasplat.engine.blocks.block_photographs import (
 from octasplat.engine.blocks.block_scene import plan_scene, train_block, train_in_blocks
 from octasplat.engine.blocks.piece_progress import PieceProgress
 from octasplat.engine.blocks.piece_training import RESULT, BlockWork
-from octasplat.engine.blocks.scene_plan import COARSE, ScenePlan, block_name, has_plan, load_plan
+from octasplat.engine.blocks.scene_plan import (
+    COARSE,
+    ScenePlan,
+    block_name,
+    has_plan,
+    load_plan,
+    load_plan_to_train,
+)
 from octasplat.engine.core.events import Noted, PhaseStarted, Warned, ignore_events
 from octasplat.engine.core.progress import phase
 from octasplat.engine.dataset import Dataset
@@ -76,9 +83,10 @@ class TrainBlock:
         """Train the block.
 
         Raises:
-            CheckpointError: the plan or the coarse scene is missing or damaged.
+            CheckpointError: the plan or the coarse scene is missing or damaged, or of a version with other
+                results.
         """
-        plan = load_plan(run.output / BLOCKS)
+        plan = load_plan_to_train(run.output / BLOCKS)
         known = read_block_photographs(run.output / BLOCKS)
         iterations = plan.iterations[self.number - 1]
         with phase("train", run.progress, iterations):

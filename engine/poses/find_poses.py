@@ -25,7 +25,7 @@ from octasplat.engine.core.events import (
     parse_event,
 )
 from octasplat.engine.core.isolated_python import python_command
-from octasplat.engine.core.writing import full_disk_error, write_json
+from octasplat.engine.core.writing import full_disk_error, replace_folder, write_json
 from octasplat.engine.poses.config import (
     DEFAULT_CONFIG,
     FEATURES,
@@ -226,9 +226,7 @@ def adjust_principal_points(
         if facts is not None:
             write_json(work / FOUND_FOLDER / RECORD_FILE, {**before, "lenses": facts})
             keep_other_models(output, work / FOUND_FOLDER)
-            if output.is_dir():  # the former model moves into the folder for the work, which is removed
-                output.rename(work / "before")
-            (work / FOUND_FOLDER).rename(output)
+            replace_folder(output, work / FOUND_FOLDER)
         process.tell_end()
     return facts
 

@@ -15,7 +15,7 @@ from typing import Any
 
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.name_lists import name_list
-from octasplat.engine.core.writing import write_json
+from octasplat.engine.core.writing import replace_folder, write_json
 from octasplat.engine.poses.config import RECORD_FILE
 
 _FOUND_MODEL = re.compile(r"(?:(?P<folder>.*)/)?poses/(?P<number>\d+)/?")
@@ -121,10 +121,9 @@ def choose_found_model(poses: Path, number: int) -> None:
             f"The search has found no model poses/{number}; {there} {'are' if folders else 'is all that is'} "
             "there."
         )
-    work = poses.with_name(f".{poses.name}.chosen")
-    shutil.rmtree(work, ignore_errors=True)
-    shutil.copytree(poses, work / "new")
-    new = work / "new"
+    new = poses.with_name(f".{poses.name}.chosen")
+    shutil.rmtree(new, ignore_errors=True)
+    shutil.copytree(poses, new)
     before = new / str(taken)
     before.mkdir()
     for path in _model_files(new):
@@ -136,9 +135,7 @@ def choose_found_model(poses: Path, number: int) -> None:
     shared = {name: record[name] for name in ("photographs_sha256",) if name in record}
     write_json(new / RECORD_FILE, {**read_pose_record(new), "number": number, **shared})
     write_other_models(new)
-    poses.rename(work / "old")
-    new.rename(poses)
-    shutil.rmtree(work)
+    replace_folder(poses, new)
 
 
 def copy_found_models(source: Path, target: Path) -> None:

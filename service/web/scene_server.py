@@ -2,7 +2,9 @@
 
 import json
 import mimetypes
+import os
 import secrets
+import shutil
 import sys
 import threading
 from collections.abc import Mapping
@@ -16,6 +18,8 @@ from octasplat.service.web.assets import STATIC_FOLDER
 from octasplat.service.web.templating import PAGE_HEADERS, render_template
 
 _LOCAL_HOSTS = frozenset({"127.0.0.1", "localhost"})
+_PIECE_BYTES = 1 << 20
+"""Of a file that is sent, at a time."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +110,7 @@ class _SceneHandler(BaseHTTPRequestHandler):
         elif path == f"{page}cameras.json":
             self._send(json.dumps(scene.cameras).encode(), "application/json")
         elif path == f"{page}scene.ply":
-            self._send(scene.ply.read_bytes(), "application/octet-stream")
+            self._send_file(scene.ply, "application/octet-stream")
         else:
             self._send_asset(path)
 
@@ -121,18 +125,26 @@ class _SceneHandler(BaseHTTPRequestHandler):
             self.send_error(404)
             return
         kind = "text/javascript" if file.suffix == ".js" else mimetypes.guess_type(file.name)[0]
-        self._send(file.read_bytes(), kind or "application/octet-stream")
+        self._send_file(file, kind or "application/octet-stream")
 
     def _send(self, content: bytes, kind: str, headers: Mapping[str, str] | None = None) -> None:
+        self._send_head(len(content), kind, headers)
+        self.wfile.write(content)
+
+    def _send_file(self, file: Path, kind: str) -> None:
+        with file.open("rb") as handle:
+            self._send_head(os.fstat(handle.fileno()).st_size, kind)
+            shutil.copyfileobj(handle, self.wfile, _PIECE_BYTES)
+
+    def _send_head(self, size_bytes: int, kind: str, headers: Mapping[str, str] | None = None) -> None:
         self.send_response(200)
         for name, value in {
             "Content-Type": kind,
-            "Content-Length": str(len(content)),
+            "Content-Length": str(size_bytes),
             **(headers or {}),
         }.items():
             self.send_header(name, value)
         self.end_headers()
-        self.wfile.write(content)
 
     def log_message(self, format: str, *arguments: object) -> None:
         """Write no log of requests."""

@@ -1,12 +1,14 @@
 """Pieces of a run in blocks made in folders of their own, as by several machines, give the run's bytes."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from octasplat.engine.blocks.scene_plan import has_plan, load_plan
+from octasplat.engine.blocks.scene_plan import has_plan, load_plan, save_plan
+from octasplat.engine.core import versions
 from octasplat.engine.core.errors import CheckpointError
 from octasplat.engine.core.events import Event, RunFinished, TrainingProgress
 from octasplat.engine.pipeline import (
@@ -18,6 +20,7 @@ from octasplat.engine.pipeline import (
     planned_blocks,
     reconstruct,
 )
+from octasplat.engine.pipeline.reconstruction import RESULT_STEPS
 from octasplat.engine.runs.config import ReconstructionConfig, resolve_config
 from tests.support.tiny_dataset import make_tiny_dataset
 
@@ -87,6 +90,15 @@ def test_plan_is_read_as_it_was_written(scene: Path, tmp_path: Path) -> None:
     assert all(block.pixels.pixel_count > 0 for block in plan.blocks)
     path = run / "blocks" / "plan.npz"
     whole = path.read_bytes()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(versions, "RESULTS_VERSION", versions.RESULTS_VERSION + 1)
+        for steps in (RESULT_STEPS, (TrainBlock(1),)):
+            with pytest.raises(CheckpointError, match="other results; go on with that version"):
+                reconstruct(scene, run, CONFIG, resume=True, threads=1, steps=steps)
+        save_plan(replace(plan, results=versions.RESULTS_VERSION), tmp_path)
+    assert (tmp_path / "plan.npz").read_bytes() != whole  # jobs tell plans by their digests
+    save_plan(load_plan(run / "blocks"), tmp_path)
+    assert (tmp_path / "plan.npz").read_bytes() == whole
     # a flipped bit asks for a password, or for a zip file of the future
     for offset, value in ((8, 1), (6, 99)):
         place = whole.index(b"PK\x01\x02") + offset

@@ -17,6 +17,7 @@ from octasplat.engine.files import (
     read_mesh,
     read_scene,
 )
+from octasplat.engine.files.compressed_khr_glb import write_compressed_glb
 from octasplat.engine.gaussians.frames import rotation_matrices
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 from octasplat.engine.gaussians.octagon import octagon_corners_world, octagon_radii
@@ -211,6 +212,41 @@ def test_khr_glb_linear_colors_are_converted_with_warning(make_scene: Make, tmp_
     inside = (scene.base_rgb_srgb > 0.05) & (scene.base_rgb_srgb < 1)
     again = srgb_to_linear(back.base_rgb_srgb)
     np.testing.assert_allclose(again[inside], scene.base_rgb_srgb[inside], atol=1e-5)
+
+
+def test_linear_colors_of_compressed_splats_are_converted_with_warning(
+    make_scene: Make, tmp_path: Path
+) -> None:
+    scene = make_scene(30)
+    write_compressed_glb(scene, tmp_path / "a.glb", np.zeros(3))
+    document, binary = parts(tmp_path / "a.glb")
+    document["meshes"][0]["primitives"][0]["extensions"][KHR]["colorSpace"] = "lin_rec709_display"
+    linear, report = read_scene(join(tmp_path / "b.glb", document, binary))
+    display, _ = read_scene(tmp_path / "a.glb")
+    assert linear.sh_degree == 0 and "linear" in report.notes[0]
+    inside = (display.base_rgb_srgb > 0.05) & (display.base_rgb_srgb < 1)
+    again = srgb_to_linear(linear.base_rgb_srgb)
+    np.testing.assert_allclose(again[inside], display.base_rgb_srgb[inside], atol=1e-5)
+
+
+def test_another_kernel_is_refused_and_an_unknown_color_space_told(make_scene: Make, tmp_path: Path) -> None:
+    scene = make_scene(30)
+    export_scene(scene, tmp_path / "a.splats.glb")
+    document, binary = parts(tmp_path / "a.splats.glb")
+    splats = document["meshes"][0]["primitives"][0]["extensions"][KHR]
+    splats["colorSpace"] = "BT.709-sRGB"  # of a draft
+    back, report = read_scene(join(tmp_path / "b.glb", document, binary))
+    assert report.notes == (
+        "Its color space BT.709-sRGB is not known; its colors were taken for srgb_rec709_display.",
+    )
+    np.testing.assert_array_equal(back.sh, scene.sh)
+    splats["kernel"] = "surflet"
+    with pytest.raises(SceneFileError, match=r"b\.glb: .* the kernel surflet, which is not read"):
+        read_scene(join(tmp_path / "b.glb", document, binary))
+    del splats["kernel"], splats["colorSpace"]  # as in earlier drafts
+    back, report = read_scene(join(tmp_path / "c.glb", document, binary))
+    assert report.notes == ()
+    np.testing.assert_array_equal(back.sh, scene.sh)
 
 
 def test_khr_glb_without_gaussians_is_refused(make_scene: Make, tmp_path: Path) -> None:

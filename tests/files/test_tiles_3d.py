@@ -75,6 +75,20 @@ def in_tile_frame(means: np.ndarray) -> np.ndarray:
     return means.astype(np.float64)[:, [0, 2, 1]] * (1, 1, -1)
 
 
+@pytest.mark.parametrize("log_scale", [88.7, 89.0])
+def test_gaussians_beyond_float32_are_refused_and_large_ones_written(
+    scene: FlatGaussians, tmp_path: Path, log_scale: float
+) -> None:
+    scene.log_scales[3:9] = log_scale
+    if log_scale > 88.72:
+        with pytest.raises(SceneFileError, match=r"tileset\.json: not written, .* too large for float32"):
+            export_scene(scene, tmp_path / "tileset.json")
+        assert list(tmp_path.iterdir()) == []
+        return
+    export_scene(scene, tmp_path / "tileset.json")
+    assert len(tileset_of(tmp_path / "tileset.json")["root"]["children"]) == 2
+
+
 def test_index_is_as_the_standard_asks(scene: FlatGaussians, tmp_path: Path) -> None:
     index, *contents = export_scene(scene, tmp_path / "out" / "tileset.json")
     document = tileset_of(index)

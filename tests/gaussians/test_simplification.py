@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from octasplat.engine.core.rays import RayBatch
+from octasplat.engine.files import read_scene
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.engine.gaussians.frames import frames_from_normals, quaternions_from_matrices
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
@@ -187,6 +188,17 @@ def test_unlike_colors_are_merged_last(make_gaussians: Make) -> None:
     assert len(np.unique(fewer.sh[:, 0].round(3), axis=0)) == 2
     assert len(simplify(make_gaussians(7), 7)) == len(simplify(make_gaussians(7), 100)) == 7
     assert len(simplify(make_gaussians(7, sh_degree=2), 1)) == 1
+
+
+@pytest.mark.parametrize("log_scale", [88.0, 88.72, 89.0, 3e38])
+def test_sizes_beyond_float32_are_merged(make_gaussians: Make, tmp_path: Path, log_scale: float) -> None:
+    gaussians = make_gaussians(20)
+    gaussians.log_scales[3:6] = log_scale
+    write_gaussian_ply(gaussians, tmp_path / "a.ply")
+    found = OPERATION.run(SimplifyRequest(source=tmp_path / "a.ply", output=tmp_path / "b.ply", count=1))
+    left, _ = read_scene(tmp_path / "b.ply")
+    assert found.kept == len(left) == 1 and left.is_finite()
+    assert 87 < left.log_scales.max() < 88.73
 
 
 def test_channels_of_pairs_are_means_or_those_of_the_larger() -> None:

@@ -8,10 +8,12 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import IO, Any
 
+import numpy as np
 import pytest
 
 from octasplat.engine.core.errors import CancelledError, ColmapCrashError, DiskFullError
 from octasplat.engine.core.events import Event, PhaseFinished, PhaseProgress, PhaseStarted, Warned
+from octasplat.engine.core.writing import write_json
 from octasplat.engine.pipeline.output_folder import claim_output, release_on_refusal
 from octasplat.engine.poses import find_poses as module
 from octasplat.engine.poses.config import (
@@ -21,7 +23,12 @@ from octasplat.engine.poses.config import (
     GivenModel,
     PoseSearchRequest,
 )
+from octasplat.engine.poses.found_models import read_pose_record
+from octasplat.engine.poses.photographs import photographs_of_scene, photographs_sha256
+from octasplat.engine.render.image_files import write_png
 from octasplat.engine.runs.config import ReconstructionConfig
+from octasplat.engine.runs.run_poses import find_missing_poses
+from tests.support.killed_rename import killed_before_rename
 from tests.support.small_disk import small_disk
 
 DONE = {"kind": "done"}
@@ -95,6 +102,27 @@ def test_last_stage_ends_when_the_model_is_in_its_place(
 
     work(tmp_path, output, hear)
     assert heard == {"features": False, last: True}
+
+
+@pytest.mark.parametrize("renames", range(3))
+def test_run_killed_while_lenses_are_adjusted_keeps_its_poses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, renames: int
+) -> None:
+    scene, output = tmp_path / "scene", tmp_path / "run"
+    for name in ("a.png", "b.png", "c.png"):
+        write_png(scene / "images" / name, np.zeros((4, 4, 3), np.float32))
+    sha256 = photographs_sha256(scene / "images", photographs_of_scene(scene))
+    former = {"photographs_sha256": sha256, "placed": 1}
+    write_json(output / "poses" / RECORD_FILE, former)
+    facts = {"reprojection_px": 1.0}
+    fake_process(monkeypatch, {"lenses": facts})
+    with killed_before_rename(renames):
+        module.adjust_principal_points(output / "poses", output / "poses")
+    config = ReconstructionConfig(poses="auto")
+    find_missing_poses(scene, output, config, 1, lambda _event: None, lambda: False)
+    expected = former if renames < 2 else {**former, "lenses": facts}
+    assert read_pose_record(output / "poses") == expected
+    assert [path.name for path in output.iterdir()] == ["poses"]
 
 
 def test_first_of_two_searches_ends_before_the_second(

@@ -31,6 +31,7 @@ from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.runs.run_poses import find_missing_poses, warn_of_other_models
 from octasplat.engine.settings.refusals import InvalidSettingsError
 from octasplat.workers.worker.job_kinds.reconstruct_kinds import ReconstructKind
+from tests.support.killed_rename import killed_before_rename
 
 NAMES = [f"{k}.jpg" for k in range(9)]
 PLACED = {0: NAMES[:4], 1: NAMES[3:7], 2: NAMES[6:]}
@@ -66,6 +67,13 @@ def write_found(poses: Path, **shared: Any) -> None:
         record = {"photographs": len(NAMES), "placed": len(placed), "left_out": left_out}
         (folder / "poses.json").write_text(json.dumps({**record, **({} if number else shared)}))
     write_other_models(poses)
+
+
+def write_photographs(scene: Path) -> str:
+    """Write three photographs, and return their digest."""
+    for k in range(3):
+        write_png(scene / "images" / f"{k}.png", np.full((4, 4, 3), k / 4, np.float32))
+    return photographs_sha256(scene / "images", photographs_of_scene(scene))
 
 
 def test_models_without_photographs_of_their_own_or_trust_are_not_kept() -> None:
@@ -121,6 +129,20 @@ def test_another_model_is_taken_and_the_first_again(tmp_path: Path) -> None:
         choose_found_model(poses, 3)
 
 
+@pytest.mark.parametrize("renames", range(11))
+def test_run_killed_while_it_chooses_a_model_goes_on_with_its_search(tmp_path: Path, renames: int) -> None:
+    scene, output = tmp_path / "scene", tmp_path / "run"
+    sha256 = write_photographs(scene)
+    write_found(output / "poses", photographs_sha256=sha256)
+    config = ReconstructionConfig(poses="auto", model="poses/1")
+    with killed_before_rename(renames):
+        choose_found_model(output / "poses", 1)
+    find_missing_poses(scene, output, config, 1, lambda _event: None, lambda: False)
+    assert (output / "poses" / "images.bin").read_text() == "1"
+    assert [model.number for model in other_models(output / "poses")] == [0, 2]
+    assert [path.name for path in output.iterdir()] == ["poses"]
+
+
 def test_other_models_stay_where_lenses_are_adjusted(tmp_path: Path) -> None:
     write_found(tmp_path / "poses")
     (tmp_path / "new").mkdir()
@@ -141,9 +163,7 @@ def test_names_of_found_models(name: str | None, expected: tuple[Path | None, in
 
 def test_run_takes_the_model_that_is_named(tmp_path: Path) -> None:
     scene = tmp_path / "scene"
-    for k in range(3):
-        write_png(scene / "images" / f"{k}.png", np.full((4, 4, 3), k / 4, np.float32))
-    sha256 = photographs_sha256(scene / "images", photographs_of_scene(scene))
+    sha256 = write_photographs(scene)
     first, other, third = (tmp_path / name for name in ("first", "other", "third"))
     write_found(first / "poses", photographs_sha256=sha256)
     named = ReconstructionConfig(model=str(first / "poses" / "1"))

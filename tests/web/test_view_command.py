@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tracemalloc
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 
 import octasplat as osp
+from octasplat.service.web.scene_server import SceneServer, ViewedScene
 from tests.support.web_harness import Browse
 
 COUNT = 300
@@ -64,6 +66,24 @@ def test_view_serves_files_of_any_format_until_interrupted(
         process.send_signal(signal.SIGINT)
         _, complaints = process.communicate(timeout=60)
         assert process.returncode == 0 and "Error" not in complaints and "Traceback" not in complaints
+
+
+def test_large_scene_is_sent_in_little_memory(tmp_path: Path) -> None:
+    large, size_bytes = tmp_path / "scene.ply", 256 << 20
+    with large.open("wb") as file:
+        file.truncate(size_bytes)
+    server = SceneServer(ViewedScene("large", large, {"views": []}, None, "black"))
+    received = 0
+    tracemalloc.start()
+    try:
+        with urllib.request.urlopen(f"{server.url}scene.ply", timeout=30) as answer:
+            assert int(answer.headers["Content-Length"]) == size_bytes
+            while piece := answer.read(1 << 20):
+                received += len(piece)
+        assert received == size_bytes and tracemalloc.get_traced_memory()[1] < 16 << 20
+    finally:
+        tracemalloc.stop()
+        server.close()
 
 
 @pytest.mark.exhaustive

@@ -4,7 +4,7 @@
     <prefix>documents/<name>        published documents
     <prefix>staging/<uuid>          content whose digest is not known beforehand
 
-Content is sent in parts of a fixed size, so memory does not grow with it, and becomes visible when the upload
+Content is sent in parts of one size, of which one is in memory, and becomes visible when the upload
 is completed, which happens after its digest is verified. A document is published by one conditional write
 (``If-None-Match: *``). Credentials and the address are found as every AWS tool finds them
 (``AWS_ACCESS_KEY_ID``, ``AWS_ENDPOINT_URL_S3`` and so on).

@@ -7,16 +7,17 @@ from typing import Any
 
 from botocore.exceptions import BotoCoreError, ClientError
 
+from octasplat.workers.storage.errors import ContentTooLargeError
 from octasplat.workers.storage.protocol import Blob
 from octasplat.workers.storage.s3_bucket import S3Bucket
 from octasplat.workers.storage.verifying_writer import VerifyingWriter
 
 PART_BYTES = 8 << 20
-"""Length of the first parts; S3 takes at most 10,000 parts of at least 5 MiB."""
-
-# With these, the 10,000 parts that S3 takes hold 515 GiB.
-_LARGE_PART_BYTES = 64 << 20
-_SMALL_PARTS = 2000
+"""Least length of all parts but the last, which S3 wants to have 5 MiB, and Cloudflare R2 one length."""
+UNKNOWN_PART_BYTES = 64 << 20
+"""Length of the parts of content that may have any length, of which S3 takes 625 GiB then."""
+MAX_PARTS = 10_000
+_MAX_BYTES = 5 << 40  # of R2; S3 takes more by now
 _COPY_BYTES = 1 << 30
 
 
@@ -32,22 +33,25 @@ class S3Writer(VerifyingWriter):
         self._bucket = bucket
         self._parts: list[Any] = []
         self._buffer = bytearray()
+        self._part_bytes = part_length(max_bytes if size_bytes is None else size_bytes)
         self._staging_key = f"{bucket.prefix}staging/{uuid.uuid4().hex}"
         self._key = self._staging_key if sha256 is None else bucket.blob_key(sha256)
 
     def _write_bytes(self, data: bytes | memoryview) -> None:
         rest = memoryview(data)
         while len(rest):
-            part_bytes = PART_BYTES if len(self._parts) < _SMALL_PARTS else _LARGE_PART_BYTES
-            taken = min(len(rest), part_bytes - len(self._buffer))
+            taken = min(len(rest), self._part_bytes - len(self._buffer))
             self._buffer += rest[:taken]
             rest = rest[taken:]
-            if len(self._buffer) >= part_bytes:
+            if len(self._buffer) >= self._part_bytes:
                 self._send_part()
 
     def _send_part(self) -> None:
         client, name = self._bucket.client, self._bucket.bucket
         number = len(self._parts) + 1
+        if number > MAX_PARTS:
+            most = MAX_PARTS * self._part_bytes
+            raise ContentTooLargeError(f"The content is larger than the {most} bytes that fit.", most)
         with self._bucket.translate_errors(self._key):
             if self._upload is None:
                 self._upload = client.create_multipart_upload(Bucket=name, Key=self._key)["UploadId"]
@@ -119,6 +123,18 @@ class S3Writer(VerifyingWriter):
                     Bucket=self._bucket.bucket, Key=self._key, UploadId=self._upload
                 )
             self._upload = None
+
+
+def part_length(most_bytes: int | None) -> int:
+    """Return the length of all parts but the last of content that is so long at most; None is not known.
+
+    >>> part_length(1000) == PART_BYTES, part_length(100_000 << 20) >> 20
+    (True, 10)
+    """
+    if most_bytes is None:
+        return UNKNOWN_PART_BYTES
+    mebibytes = -(-min(most_bytes, _MAX_BYTES) // (MAX_PARTS << 20))
+    return max(PART_BYTES, mebibytes << 20)
 
 
 class S3RangeReader(io.RawIOBase):
