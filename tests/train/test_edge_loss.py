@@ -14,7 +14,6 @@ from octasplat.engine.trace.protocol import TraceResult
 from octasplat.engine.train.config import LossWeights
 from octasplat.engine.train.optimization.edge_loss import edge_gradient, passes_edge
 from octasplat.engine.train.sampling.batches import Batch, BatchOptions, BatchSource
-from octasplat.engine.train.sampling.edge_tiles import MISSES_KEPT
 from tests.support.planar_dataset import PlanarDataset
 
 
@@ -78,9 +77,7 @@ def test_gradient_of_the_edge_term_is_its_slope(exposed: bool) -> None:
         return 0.7 * float((squared.mean(axis=1) * chosen).sum() / 300)
 
     shading = exposures if exposed else PLAIN_SHADING
-    recording, by_trace, passing = edge_gradient(batch, tracer, shading, weights, training_progress=0.5)
-    assert (passing == chosen).all()
-    found = tracer.backward(recording, by_trace).numpy()
+    found = tracer.backward(*edge_gradient(batch, tracer, shading, weights, training_progress=0.5)).numpy()
     logits = start.opacity_logits.astype(np.float64)
     for row in np.argsort(-np.abs(found.opacity_logits))[:5]:
         step = np.zeros(60)
@@ -89,38 +86,15 @@ def test_gradient_of_the_edge_term_is_its_slope(exposed: bool) -> None:
         assert found.opacity_logits[row] == pytest.approx(slope, rel=0.02)
 
 
-def test_further_rays_are_drawn_where_earlier_ones_passed_an_edge() -> None:
+def test_further_rays_are_drawn_where_the_loss_has_the_term() -> None:
     options = BatchOptions(256, "black", 64, 16, None, 16, 0.0)
     world = PlanarDataset()
-    plain = BatchSource(world, options)
-    plain.look_for_edges()
-    source = BatchSource(world, replace(options, has_edge_rays=True))
-    source.look_for_edges()
-    batch, first = source.draw(np.random.default_rng(0), 3), plain.draw(np.random.default_rng(0), 3)
-    assert first.edge_batch is None and batch.edge_batch is not None
-    assert (first.rays.directions_world == batch.rays.directions_world).all()
-    assert len(batch.edge_batch.rays) == 128 and batch.edge_batch.pixel_share == 1.0
-    assert source.edge_tiles is not None
-    view, y, x = (axis.reshape(-1) for axis in np.meshgrid(world.train_indices, range(40), range(40)))
-    for _ in range(MISSES_KEPT):
-        source.edge_tiles.observe(view, y, x, (x == 20) & (y < 10))
-    rng, drawn = np.random.default_rng(1), []
-    source.look_for_edges()
-    for index in range(40):
-        edge_batch = source.draw(rng, index).edge_batch
-        assert edge_batch is not None and edge_batch.pixels is not None
-        drawn.append(np.stack(edge_batch.pixels))
-    rows, columns = np.concatenate(drawn, axis=1)[1:]
-    # the tile beside each counts as well
-    assert set(columns.tolist()) == {19, 20, 21} and set(rows.tolist()) == set(range(11))
-    assert edge_batch.pixel_share == pytest.approx(33 / 1600)
-    kept = BatchSource(world, replace(options, has_edge_rays=True))
-    assert kept.edge_tiles is not None
-    kept.edge_tiles.restore(source.edge_tiles.state())
-    kept.exclude_views(world.train_indices[:1])
-    kept.look_for_edges()
-    other = kept.draw(np.random.default_rng(2)).edge_batch
-    assert other is not None and set(other.view.tolist()) == set(world.train_indices[1:].tolist())
+    plain = BatchSource(world, options).draw(np.random.default_rng(0), 3)
+    both = BatchSource(world, replace(options, has_edge_rays=True)).draw(np.random.default_rng(0), 3)
+    assert plain.edge_batch is None and both.edge_batch is not None
+    assert (plain.rays.directions_world == both.rays.directions_world).all()
+    assert len(both.edge_batch.rays) == 256
+    assert (both.edge_batch.rays.directions_world != both.rays.directions_world).any()
 
 
 @pytest.mark.parametrize(

@@ -80,9 +80,9 @@ class LossWeights(Settings):
     edges: Annotated[float | None, Unit("weight"), EXPERIMENTAL] = Field(
         None,
         ge=0,
-        description="Weight of the difference from the photographs of half as many further rays as a batch "
-        "has, drawn where earlier ones passed an edge, which show harmonics; with materials of the recipe "
-        "split_sum alone. Thin parts and outlines come out better, for about a tenth more time.",
+        description="Weight of the difference from the photographs of as many further rays as a batch has, "
+        "which show harmonics, where they pass an edge; with materials of the recipe split_sum alone. Thin "
+        "parts and outlines come out better, for about a fifth more time.",
     )
     depth_normal: Annotated[float, Unit("weight"), ADVANCED] = Field(
         0.0,

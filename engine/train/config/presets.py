@@ -13,7 +13,7 @@ FLIP_NORMAL_COS = 0.5
 """Cosine beyond which normals that point away are turned, where materials are learnt."""
 SHORT_TRAINING = 5000
 """Iterations of a preset without materials up to which those with them take larger steps and grow sooner."""
-SHORT_EDGE_WEIGHT = 3.0
+SHORT_EDGE_WEIGHT = 1.0
 """``loss.edges`` of such a training with materials."""
 SHORT_MATERIAL_RATES = {"mean": 0.05, "log_scale": 0.04, "albedo": 0.08, "metallic": 0.05, "roughness": 0.05}
 

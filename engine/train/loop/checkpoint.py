@@ -28,7 +28,7 @@ from octasplat.engine.train.optimization.weight_averaging import WeightAverage
 CHECKPOINT_FORMAT = 6
 KEPT_CHECKPOINTS = 2
 _PREFIX = "iteration_"
-_GROUPS = ("gaussians", "adam", "average", "densifier", "shading", "poses", "edges")
+_GROUPS = ("gaussians", "adam", "average", "densifier", "shading", "poses")
 ARCHIVE_DAMAGE = (
     OSError, KeyError, ValueError, TypeError, AttributeError, EOFError, RuntimeError, MemoryError,
     OverflowError, struct.error, zlib.error, zipfile.BadZipFile,
@@ -91,8 +91,6 @@ def save_checkpoint(state: TrainState, folder: Path, fingerprint: str) -> Path:
     arrays |= {f"shading.{name}": value for name, value in state.shading.items()}
     if len(state.pose_corrections):
         arrays["poses.corrections"] = state.pose_corrections
-    if len(state.edge_tiles):
-        arrays["edges.tiles"] = state.edge_tiles
     meta["arrays"] = sorted(arrays)  # listed, so that a missing array is noticed
     with atomic_replace(path) as temporary:
         np.savez(temporary, meta=np.array(json.dumps(meta)), **arrays)
@@ -149,7 +147,6 @@ def load_checkpoint(path: Path, fingerprint: str | None = None) -> TrainState:
         early_stop_at=meta["hastened_after"],
         pruned_near_cameras=meta["taken_near"],
         pose_corrections=groups["poses"].get("corrections", np.zeros((0, 6))),
-        edge_tiles=groups["edges"].get("tiles", np.zeros(0, np.uint8)),
         average=WeightAverage(mean, meta["averaged"]),
     )
 

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool
 
 from octasplat.engine.core.errors import TrainingError
 from octasplat.engine.shading.protocol import (
@@ -22,7 +21,7 @@ from octasplat.engine.train.config import LearningRates, LossWeights
 from octasplat.engine.train.densify import Densifier
 from octasplat.engine.train.loop.state import TrainState
 from octasplat.engine.train.optimization.depth_loss import add_depth_gradient
-from octasplat.engine.train.optimization.edge_loss import edge_gradient, passes_edge
+from octasplat.engine.train.optimization.edge_loss import edge_gradient
 from octasplat.engine.train.optimization.losses import BatchLoss, batch_loss, ray_errors
 from octasplat.engine.train.sampling.batches import Batch
 from octasplat.engine.train.sampling.visibility_rays import free_space_gradient
@@ -49,15 +48,12 @@ class LossGradients:
         gaussians: gradients by the Gaussians' parameters.
         shading: gradients by the shading model's own parameters.
         hits_per_ray: mean number of Gaussians on a ray.
-        passes_edge: which rays pass an edge, of the batch and of its rays for edges; empty where there are
-            none of these.
     """
 
     loss: BatchLoss
     gaussians: GaussianGradients
     shading: Mapping[str, np.ndarray]
     hits_per_ray: float
-    passes_edge: tuple[Bool[np.ndarray, " _"], ...] = ()
 
 
 def loss_and_gradients(
@@ -104,13 +100,10 @@ def loss_and_gradients(
                 batch.visibility_rays, tracer, weights.free_space, min_hidden=weights.free_space_from or 0.0
             )
         )
-    passing: tuple[Bool[np.ndarray, " _"], ...] = ()
     if batch.edge_batch is not None:
-        *of_edges, passes = edge_gradient(
-            batch.edge_batch, tracer, shading, weights, training_progress=training_progress
+        recorded.append(
+            edge_gradient(batch.edge_batch, tracer, shading, weights, training_progress=training_progress)
         )
-        recorded.append((of_edges[0], of_edges[1]))
-        passing = passes_edge(result), passes
     # What several recordings say has to be added up first.
     min_trace_weight = min_blend_weight if len(recorded) == 1 else 0.0
     gradients = [
@@ -121,7 +114,6 @@ def loss_and_gradients(
         gaussians=drop_low_weight(add_gradients(gradients), min_blend_weight),
         shading=grad_shading.parameters,
         hits_per_ray=float(result.hit_counts.mean()),
-        passes_edge=passing,
     )
 
 

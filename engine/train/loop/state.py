@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float64, Int64, UInt8
+from jaxtyping import Float64, Int64
 from scipy.spatial import cKDTree
 
 from octasplat.engine.dataset.model import Viewpoints
@@ -29,7 +29,6 @@ class TrainState:
         best_psnr: best probe so far, dB; the Gaussians that reached it are in ``best.npz``.
         best_iteration: when that was.
         excluded_views: training views that are left out from here on.
-        edge_tiles: what rays have told of edges, as of the last checkpoint; empty where none are looked for.
         average: the mean of the last states, where they are averaged.
         pose_corrections: of all views, where poses are refined: the rotation vectors (rad) and shifts (world
             units) by which the points of their cameras move.
@@ -53,7 +52,6 @@ class TrainState:
     early_stop_at: int | None = None
     pruned_near_cameras: int = 0
     pose_corrections: Float64[np.ndarray, "v 6"] = field(default_factory=lambda: np.zeros((0, 6)))
-    edge_tiles: UInt8[np.ndarray, " t"] = field(default_factory=lambda: np.zeros(0, np.uint8))
     average: WeightAverage = field(default_factory=WeightAverage)
 
     def raise_sh_degree(self, degree: int) -> None:

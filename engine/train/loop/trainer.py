@@ -125,8 +125,6 @@ class Trainer:
                 state.pose_corrections = np.zeros((len(dataset.views), 6))
         self._dataset = dataset
         self._batches = BatchSource(dataset, BatchOptions.from_config(config, dataset), observed=given)
-        if self._batches.edge_tiles is not None:
-            self._batches.edge_tiles.restore(state.edge_tiles)
         pixels, valid = self._batches.sampler.pixel_count, valid_pixel_fraction(dataset)
         # its length first: rates and the strategy depend on it
         self.schedule = Schedule.from_config(config, iteration_count(config, pixels, valid))
@@ -213,7 +211,6 @@ class Trainer:
                 loss=self._config.loss, lr=self._config.lr, min_blend_weight=self._config.min_blend_weight,
                 training_progress=progress, extent=self._extent,
             )  # fmt: skip
-            self._batches.observe_edges(batch, step.passes_edge)
             is_stale = schedule.may_densify(state.iteration) and self._update_gaussians()
             # rows belong to other Gaussians now
             if is_stale:
@@ -280,7 +277,6 @@ class Trainer:
             self._components = replace(self._components, tracer=self._make_tracer())
         gaussians, tracer, shading = self.state.gaussians, self._components.tracer, self._components.shading
         tracer.build(gaussians, shading.features(gaussians))
-        self._batches.look_for_edges()
         self._orient_normals()
         progress = self.schedule.training_progress(self.state.iteration)
         shading.on_rebuild(gaussians, tracer, training_progress=progress)
@@ -367,8 +363,6 @@ class Trainer:
         state = self.state
         state.densifier = self._components.densifier.state()
         state.shading = self._components.shading.state()
-        if self._batches.edge_tiles is not None:
-            state.edge_tiles = self._batches.edge_tiles.state()
         path = save_checkpoint(state, self._folder, self._fingerprint)
         self._progress(CheckpointWritten(state.iteration, str(path)))
 

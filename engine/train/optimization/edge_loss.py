@@ -2,9 +2,9 @@
 
 A ray with materials and what it reflects takes several times as long as one that shows harmonics. So a
 training with materials sees each pixel a few times only, and when it ends, thin parts and outlines are not
-yet where they belong. Harmonics tell a thing from what is behind it as well. So further rays, drawn from
-where earlier ones passed an edge, show harmonics, and where they pass one the difference from the photographs
-moves the Gaussians. Elsewhere it does not: harmonics explain reflections by Gaussians behind the surface.
+yet where they belong. Harmonics tell a thing from what is behind it as well. So further rays show harmonics,
+and where they pass an edge the difference from the photographs moves the Gaussians. Elsewhere it does not:
+harmonics explain reflections by Gaussians behind the surface.
 """
 
 import numpy as np
@@ -36,12 +36,11 @@ def passes_edge(result: TraceResult) -> Bool[np.ndarray, " r"]:
 
 def edge_gradient(
     batch: Batch, tracer: Tracer, shading: ShadingModel, weights: LossWeights, *, training_progress: float
-) -> tuple[Recording, TraceGradients, Bool[np.ndarray, " r"]]:
-    """Return the recording of rays that show harmonics, gradients of their loss, and which pass an edge.
+) -> tuple[Recording, TraceGradients]:
+    """Return the recording of rays that show harmonics, and gradients of their loss where they pass an edge.
 
     The loss is ``weights.edges`` times that of :func:`pixel_loss` over the whole batch, of which rays that
-    pass no edge leave out their part, times the share of all pixels that the batch is drawn from. Harmonics
-    are exposed as the views are, where that is learnt.
+    pass no edge leave out their part. Harmonics are exposed as the views are, where that is learnt.
     """
     result = tracer.trace(batch.rays, record=True)
     assert result.recording is not None
@@ -51,8 +50,7 @@ def edge_gradient(
     shaded = plain.shade(traced)
     render = shaded.composite_over(batch.background_srgb)
     loss = pixel_loss(render, batch.target_srgb, batch.weight, l1=weights.l1, l2=weights.l2)
-    passing = passes_edge(result)
-    chosen = np.float32((weights.edges or 0.0) * batch.pixel_share) * passing.astype(np.float32)
+    chosen = np.float32(weights.edges or 0.0) * passes_edge(result).astype(np.float32)
     by_color: Float32[np.ndarray, "r 3"] = loss.gradient * chosen[:, None]
     gradients = ShadedRayGradients(by_color, by_color @ batch.background_srgb)
-    return result.recording, plain.backward(traced, shaded, gradients).trace, passing
+    return result.recording, plain.backward(traced, shaded, gradients).trace

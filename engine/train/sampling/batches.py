@@ -1,13 +1,12 @@
 """Batches of rays: random pixels over all training views, mixed with whole square patches for SSIM."""
 
 import math
-from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int64
+from jaxtyping import Float32, Int64
 
 from octasplat.engine.core.color import composite_over
 from octasplat.engine.core.errors import ConfigError
@@ -21,24 +20,16 @@ from octasplat.engine.train.config import (
     max_gaussian_count,
     ray_patch_side_px,
 )
-from octasplat.engine.train.sampling.edge_tiles import EdgeTiles
 from octasplat.engine.train.sampling.pixel_sampler import (
-    PixelSampler,
     TrainingData,
     has_known_distances,
     known_distances,
     pixel_sampler,
     valid_pixel_fraction,
-    view_sizes_px,
 )
 from octasplat.engine.train.sampling.visibility_rays import ObservedPoints, VisibilityRays
 
 TILE_PX = 8
-EDGE_RAY_FRACTION = 0.5
-"""Rays for the term of the loss for edges, of those of a batch."""
-
-
-Pixels = tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]
 
 
 @dataclass(frozen=True)
@@ -49,8 +40,7 @@ class Batch:
     ``ray_patches`` says which of the others form patches. ``background_srgb`` lies
     behind both the Gaussians and photographs with alpha. ``visibility_rays`` end before points that views
     show. ``known_distances`` are those of the surface along the rays by depth maps, world units, 0 where
-    unknown. ``pixels`` are the view, row and column of each ray's pixel. ``edge_batch`` has further rays, for
-    the term of the loss for edges, which are drawn from a share of all pixels, ``pixel_share``.
+    unknown. ``edge_batch`` has further rays, for the term of the loss for edges.
     """
 
     rays: RayBatch
@@ -64,8 +54,6 @@ class Batch:
     visibility_rays: RayBatch | None = None
     ray_patches: RayPatches | None = None
     known_distances: Float32[np.ndarray, " r"] | None = None
-    pixels: Pixels | None = None
-    pixel_share: float = 1.0
     edge_batch: "Batch | None" = None
 
     @cached_property
@@ -156,11 +144,6 @@ class BatchSource:
         self._dataset = dataset
         self._options = options
         self.sampler = pixel_sampler(dataset, dataset.train_indices)
-        self._excluded_views = np.zeros(0, np.int64)
-        self.edge_tiles: EdgeTiles | None = None
-        self._edge_sampler: tuple[PixelSampler, float] | None = None
-        if options.has_edge_rays:
-            self.edge_tiles = EdgeTiles(dataset.train_indices, view_sizes_px(dataset))
         self._ssim_patches = self._patch_count()
         self._reads_depths = options.reads_depths and has_known_distances(dataset)
         self._visibility_rays: VisibilityRays | None = None
@@ -171,7 +154,6 @@ class BatchSource:
 
     def exclude_views(self, views: Int64[np.ndarray, " m"]) -> None:
         """Draw nothing of these views any more."""
-        self._excluded_views = views
         remaining = np.setdiff1d(self._dataset.train_indices, views)
         self.sampler = pixel_sampler(self._dataset, remaining)
         if self._visibility_rays is not None:
@@ -180,38 +162,12 @@ class BatchSource:
     def draw(self, rng: np.random.Generator, index: int = 0) -> Batch:
         """Draw the next batch, after ``index`` others."""
         batch = self._draw(rng, index)
-        if self._edge_sampler is not None:
-            batch = replace(batch, edge_batch=self._draw_edge_rays(rng, *self._edge_sampler))
+        if self._options.has_edge_rays:
+            # counted backwards, so that they look elsewhere than the batch itself
+            edge_batch = self._draw(rng, -1 - index)
+            _ = edge_batch.target_srgb
+            batch = replace(batch, edge_batch=edge_batch)
         _ = batch.target_srgb  # worked out here, as the next batch is drawn beside the iteration
-        return batch
-
-    def observe_edges(self, batch: Batch, passes_edge: Sequence[Bool[np.ndarray, " _"]]) -> None:
-        """Take note of which rays of a batch pass an edge, and of its rays for edges; of none if empty."""
-        for rays, passing in zip((batch, batch.edge_batch), passes_edge, strict=False):
-            if self.edge_tiles is not None and rays is not None and rays.pixels is not None:
-                self.edge_tiles.observe(*rays.pixels, passing)
-
-    def look_for_edges(self) -> None:
-        """Draw rays for edges from where :attr:`edge_tiles` has them now."""
-        if self.edge_tiles is not None:
-            self._edge_sampler = self.edge_tiles.sampler(self._excluded_views)
-
-    def _draw_edge_rays(self, rng: np.random.Generator, sampler: PixelSampler, share: float) -> Batch:
-        view, y, x = sampler.pixels(rng, max(1, round(EDGE_RAY_FRACTION * self._options.rays_per_batch)))
-        rgb, alpha, weight = self._dataset.pixels(view, y, x)
-        batch = Batch(
-            rays=self._dataset.rays(view, y, x),
-            rgb_srgb=rgb,
-            alpha=alpha,
-            weight=weight,
-            view=view,
-            ssim_patch_count=0,
-            patch_side=self._options.ssim_patch_side_px,
-            background_srgb=self._background_colors(rng),
-            pixels=(view, y, x),
-            pixel_share=share,
-        )
-        _ = batch.target_srgb
         return batch
 
     def _draw(self, rng: np.random.Generator, index: int) -> Batch:
@@ -254,7 +210,6 @@ class BatchSource:
             visibility_rays=visibility_rays,
             ray_patches=ray_patches,
             known_distances=distances,
-            pixels=(view, y, x),
         )
 
     def _patch_count(self) -> int:
