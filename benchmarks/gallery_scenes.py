@@ -289,7 +289,7 @@ def write_strips(folder: Path, figures: SceneFigures, pictures: Path, name: str,
     run = folder / "run"
     background = json.loads((run / METRICS).read_text(encoding="utf-8"))["background"]
     record = read_views(run / VIEWS)
-    names = [view.name for view in record.views if view.held_out]
+    names = [view.name for view in record.views]
     renders = dict(zip(names, unique_render_names(names), strict=True))
     for what, shown in (("worst", figures.worst), ("median", figures.median)):
         taken = photograph(folder / "photographs", shown.name, background)

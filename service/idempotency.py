@@ -16,6 +16,13 @@ def fingerprint(*parts: Any) -> str:
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
 
 
+async def is_repeated(connection: Connection, principal: Principal, key: str) -> bool:
+    """Return whether a request with this key was answered before; then :func:`create_once` makes nothing."""
+    query = "SELECT 1 FROM idempotency_keys WHERE owner = %s AND key = %s"
+    cursor = await connection.execute(query, [principal.owner, key])
+    return await cursor.fetchone() is not None
+
+
 async def create_once(
     connection: Connection,
     principal: Principal,

@@ -11,6 +11,7 @@ from pydantic import Field, IPvAnyNetwork, SecretStr
 from octasplat.engine.core.errors import ConfigError
 from octasplat.service.connection_limits import ConnectionLimits, connections_for
 from octasplat.service.intake.dataset import DatasetLimits
+from octasplat.service.intake.mesh_check import MeshLimits
 from octasplat.service.intake.model_check import ModelLimits
 from octasplat.service.intake.receive import UploadLimits
 from octasplat.service.intake.spool import SpoolSpace
@@ -208,6 +209,10 @@ class ServiceSettings(WorkerSettings):
     def dataset_limits(self) -> DatasetLimits:
         """Return the limits of the validation of datasets."""
         return DatasetLimits(model=ModelLimits(hidden=self.own_folders))
+
+    def mesh_limits(self) -> MeshLimits:
+        """Return the limits of the check of meshes before a job is queued."""
+        return MeshLimits(hidden=self.own_folders)
 
     def spool(self) -> SpoolSpace:
         """Return the spool folder for uploaded archives, with its limits."""

@@ -22,6 +22,8 @@ class ThreadPurpose(Enum):
     """Checking datasets; :mod:`octasplat.service.actions.task_runner` bounds how many at once."""
     OPTIONS = auto()
     """Validating options, a stage's text among them."""
+    MESHES = auto()
+    """Checking meshes of jobs before these are queued, in child processes."""
     BODIES = auto()
     """Counting what bodies hold before they are parsed."""
     DOWNLOADS = auto()
@@ -35,6 +37,7 @@ _POOL_SIZES = {
     ThreadPurpose.UNPACKING: 3,
     ThreadPurpose.CHECKS: 8,
     ThreadPurpose.OPTIONS: 2,
+    ThreadPurpose.MESHES: 2,
     ThreadPurpose.BODIES: 2,
     ThreadPurpose.DOWNLOADS: 12,
     ThreadPurpose.STORE_CHECKS: 4,

@@ -305,11 +305,11 @@ def rendered_pixels(options: PictureOptions, photographs: Sequence[ImageSizes]) 
         return (1 if is_preview else path.frame_count) * path.width * path.height
     if options.mode != "views":
         return (1 if is_preview else options.frame_count) * options.width_px * options.height_px
-    # which sizes the named photographs have is not known here: the largest
     shrunk = [capped_sizes(sizes, options.max_side) for sizes in photographs]
-    if options.photographs is not None:
+    # which sizes the named photographs have, or the first view, is not known here: the largest
+    if is_preview or options.photographs is not None:
         largest = max((sizes.width_px * sizes.height_px for sizes in shrunk), default=0)
-        return largest * (1 if is_preview else len(options.photographs))
+        return largest * (1 if is_preview else len(options.photographs or ()))
     return sum(sizes.width_px * sizes.height_px * sizes.count for sizes in shrunk)
 
 

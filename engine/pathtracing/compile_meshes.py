@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.core.local_origin import NO_ORIGIN, Origin, vertices_about
+from octasplat.engine.core.local_origin import NO_ORIGIN, Origin
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.pathtracing.environment import EnvironmentMap, environment_frame
 from octasplat.engine.pathtracing.imported_materials import ImportedMaterial, import_material
@@ -28,12 +28,10 @@ from octasplat.engine.pathtracing.lights import (
     triangle_areas,
 )
 from octasplat.engine.pathtracing.material_table import MaterialTable
+from octasplat.engine.pathtracing.mesh_files import MeshShape, count_open_edges, load_file_shape
 from octasplat.engine.pathtracing.mesh_shapes import (
-    MeshShape,
     corner_normals,
-    count_open_edges,
     primitive_shape,
-    read_shape,
     transform_normals,
     transform_points,
     turn_outwards,
@@ -367,32 +365,9 @@ def load_mesh_shape(
     Vertices of a file that has them in large coordinates are about ``origin_world``.
 
     Raises:
-        ConfigError: it is of glass and not closed.
+        ConfigError: its file is to be glass and is not closed, or holds no triangles.
         SceneFileError: its file cannot be read.
     """
     if mesh.shape is not None:
-        shape, name = primitive_shape(mesh.shape), str(mesh.shape)
-    else:
-        assert mesh.file is not None
-        shape, name = read_shape(folder / mesh.file), str(folder / mesh.file)
-        shape = replace(shape, vertices=vertices_about(shape.vertices, origin_world))
-    if isinstance(mesh.material, Glass):
-        count = count_open_edges(shape)
-        if count:
-            raise ConfigError(
-                f"meshes[{number}]: {name} is not closed ({count:,} edges without two faces that wind "
-                "alike), so that it cannot be glass; close it or choose another material."
-            )
-    return shape
-
-
-def check_glass_is_closed(stage: Stage, folder: Path) -> None:
-    """Check the meshes of files that are to be glass, relative to ``folder``.
-
-    Raises:
-        ConfigError: one is not closed.
-        SceneFileError: one cannot be read.
-    """
-    for number, mesh in enumerate(stage.meshes):
-        if isinstance(mesh.material, Glass) and mesh.file is not None:
-            load_mesh_shape(mesh, number, folder)
+        return primitive_shape(mesh.shape)
+    return load_file_shape(mesh, number, folder, origin_world)

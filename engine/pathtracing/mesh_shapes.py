@@ -1,19 +1,15 @@
-"""Meshes of a stage: primitives, files, placement, and smooth normals."""
+"""Meshes of a stage: primitives, placement, smooth normals, and the outside of solids."""
 
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
+from jaxtyping import Bool, Float, Float32, Float64
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
-from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.files import read_mesh
-from octasplat.engine.geometry.mesh_material import MeshMaterial
-from octasplat.engine.geometry.triangle_mesh import edge_report
 from octasplat.engine.pathtracing.kernels.smooth_normals import smooth_normals
+from octasplat.engine.pathtracing.mesh_files import WELD_TOLERANCE, MeshShape, weld_vertices
 from octasplat.engine.pathtracing.stage.base import Transformed
 
 SPHERE_DIVISIONS = 5
@@ -21,64 +17,11 @@ CLOSED_TOLERANCE = 1e-6
 """Share of the area of a closed solid that is left where the areas of its faces are added as vectors."""
 MAX_SOLIDS = 2000
 """So many solids of one mesh, the largest ones, are looked at for what lies within others."""
-WELD_TOLERANCE = 1e-6
-"""Points nearer than this share of the mesh's size are one, whatever the file says."""
-
-
-@dataclass(frozen=True)
-class MeshShape:
-    """Triangles in their own frame.
-
-    Attributes:
-        vertices: positions.
-        faces: three vertices each, anticlockwise from outside.
-        corner_uv: texture coordinates of the faces' corners, (0, 0) at the upper left, NaN where there are
-            none; None without any.
-        corner_normals: of the faces' corners, NaN where they are not known; None without any.
-        corner_rgb_linear: colors of the faces' corners; None without any.
-        corner_alpha: alpha of these colors, NaN where there is none; None without any.
-        material_numbers: row of each face in ``materials``, -1 for none; None without any.
-        materials: of the file.
-        notes: sentences on what of the file's shape is passed over.
-    """
-
-    vertices: Float64[np.ndarray, "v 3"]
-    faces: Int64[np.ndarray, "f 3"]
-    corner_uv: Float32[np.ndarray, "f 3 2"] | None = None
-    corner_normals: Float64[np.ndarray, "f 3 3"] | None = None
-    corner_rgb_linear: Float32[np.ndarray, "f 3 3"] | None = None
-    corner_alpha: Float32[np.ndarray, "f 3"] | None = None
-    material_numbers: Int32[np.ndarray, " f"] | None = None
-    materials: tuple[MeshMaterial, ...] = ()
-    notes: tuple[str, ...] = ()
 
 
 def primitive_shape(name: str) -> MeshShape:
     """Return a ``sphere`` of radius 1, a ``cube`` from -1 to 1, or a ``plane`` from -1 to 1 with normal y."""
     return {"sphere": _sphere_shape, "cube": _cube_shape, "plane": _plane_shape}[name]()
-
-
-def read_shape(path: Path) -> MeshShape:
-    """Return the triangles of a mesh file with its materials.
-
-    Raises:
-        SceneFileError: the file cannot be read.
-        ConfigError: it holds no triangles.
-    """
-    mesh = read_mesh(path, with_materials=True)
-    if len(mesh.triangles) == 0:
-        raise ConfigError(f"{path}: holds no triangles, so that light has nothing to fall on.")
-    return MeshShape(
-        vertices=mesh.vertices,
-        faces=mesh.triangles,
-        corner_uv=mesh.corner_uv,
-        corner_normals=None if mesh.corner_normals is None else mesh.corner_normals.astype(np.float64),
-        corner_rgb_linear=None if mesh.rgb_linear is None else mesh.rgb_linear[mesh.triangles],
-        corner_alpha=None if mesh.alpha is None else mesh.alpha[mesh.triangles],
-        material_numbers=mesh.material_indices,
-        materials=mesh.materials,
-        notes=mesh.notes,
-    )
 
 
 def rotation_matrix(degrees: tuple[float, float, float]) -> Float64[np.ndarray, "3 3"]:
@@ -161,29 +104,6 @@ def corner_normals(
     return normals
 
 
-def count_open_edges(shape: MeshShape, face_mask: Bool[np.ndarray, " f"] | None = None) -> int:
-    """Return the number of edges not shared by two consistently wound faces; a closed mesh has none.
-
-    Vertices that lie in one place count as one, as in files that repeat them for normals and textures.
-    """
-    faces = _welded(shape.vertices)[shape.faces if face_mask is None else shape.faces[face_mask]].astype(
-        np.int32
-    )
-    # faces welded to a line have edges of their own, which are no holes
-    sound = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    report = edge_report(faces[sound])
-    return report.open_edges + report.non_manifold_edges + report.inconsistent_edges
-
-
-def _welded(vertices: Float64[np.ndarray, "v 3"]) -> Int64[np.ndarray, " v"]:
-    """Return the same number for vertices that lie in one place."""
-    size = max(float(np.ptp(vertices, axis=0).max()), 1e-30)
-    _, owner = np.unique(
-        np.round(vertices / (WELD_TOLERANCE * size)).astype(np.int64), axis=0, return_inverse=True
-    )
-    return owner.reshape(-1)
-
-
 def turn_outwards(shape: MeshShape, face_mask: Bool[np.ndarray, " f"]) -> MeshShape | None:
     """Return a shape with closed faces that face inwards turned over; None where none do.
 
@@ -226,7 +146,7 @@ def turn_outwards(shape: MeshShape, face_mask: Bool[np.ndarray, " f"]) -> MeshSh
 def _faces_inwards(shape: MeshShape, face_mask: Bool[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
     """Return the faces of solids that face inwards, or that lie within such a one."""
     faces = shape.faces[face_mask]
-    owner = _welded(shape.vertices)
+    owner = weld_vertices(shape.vertices)
     edges = owner[faces[:, [0, 1, 1, 2]]].reshape(-1, 2).T
     count = int(owner.max()) + 1
     links = coo_array((np.ones(edges.shape[1], bool), (edges[0], edges[1])), (count, count))

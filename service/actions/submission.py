@@ -11,6 +11,7 @@ from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.operations.cost_model import Estimate
 from octasplat.engine.settings.renamed_settings import collect_notices
 from octasplat.service.actions.access import check_not_draining, fetch_visible_job
+from octasplat.service.actions.glass_meshes import check_glass_meshes
 from octasplat.service.actions.jobs import job_view
 from octasplat.service.actions.named_files import check_named_files
 from octasplat.service.actions.start_sources import fetch_start_source, lacks_source, options_with_start
@@ -22,7 +23,7 @@ from octasplat.service.actions.validation import (
     validate_kind,
 )
 from octasplat.service.auth import Principal
-from octasplat.service.idempotency import create_once, fingerprint
+from octasplat.service.idempotency import create_once, fingerprint, is_repeated
 from octasplat.service.job_limits import (
     check_job_limits,
     check_priority,
@@ -100,6 +101,8 @@ async def submit_job(
     check_priority(principal, request.priority, service.settings)
     if request.webhook is not None:
         check_webhook_address(service, request.webhook.url, "#/webhook/url")
+    if not await _is_repeated(service, principal, idempotency_key):
+        await check_glass_meshes(service, principal, kind, options.complete, request.files_id)
     async with service.pool.connection() as connection, connection.transaction():
 
         async def make() -> uuid.UUID:
@@ -136,11 +139,15 @@ async def retry_job(
         ConflictError: it waits, runs or has succeeded.
         QuotaExceededError: its owner has too many jobs.
     """
+    if not await _is_repeated(service, principal, idempotency_key):
+        await _check_retried_meshes(service, principal, job_id, request)
     async with service.pool.connection() as connection, connection.transaction():
         owner = (await fetch_visible_job(connection, principal, job_id)).owner
 
         async def make() -> uuid.UUID:
             await lock_owner(connection, owner)
+            # Before the job that waited for them, see workers.db.locks.
+            await rows.lock_blocks(connection, job_id)
             job = await fetch_visible_job(connection, principal, job_id, lock=True)
             await check_new_job(connection, owner, service.settings.quota)
             revised = await _revised_options(connection, service, principal, job, request)
@@ -157,6 +164,14 @@ async def retry_job(
         job = await fetch_visible_job(connection, principal, job_id)
         view = await job_view(connection, service, principal, job)
         return view.model_copy(update={"notes": [*view.notes, *notices]})
+
+
+async def _is_repeated(service: Service, principal: Principal, key: str | None) -> bool:
+    """Return whether a request was answered before, on a connection of its own."""
+    if key is None:
+        return False
+    async with service.pool.connection() as connection:
+        return await is_repeated(connection, principal, key)
 
 
 async def _create_job(
@@ -289,11 +304,22 @@ async def _get_photographs(connection: Connection, principal: Principal, dataset
     return dataset
 
 
-async def _revised_options(
-    connection: Connection, service: Service, principal: Principal, job: Job, request: RetryRequest
-) -> rows.RevisedOptions | None:
-    """Return the checked options of a retried job; None leaves them as they are."""
-    workers = await live_workers_of_queue(connection, job.queue, service.settings.stale_seconds)
+@dataclass(frozen=True)
+class _Retry:
+    """A job that is to be tried again: its kind, its options before and now, and whether it goes on."""
+
+    kind: JobKind
+    before: BaseModel
+    revised: ResolvedOptions
+    is_resumed: bool
+
+
+async def _resolve_retry(job: Job, request: RetryRequest) -> _Retry | None:
+    """Return what a retry asks for, validated; None where a job of another version is left as it is.
+
+    Raises:
+        ProblemError: 409 or 422.
+    """
     try:
         kind = get_job_kind(job.kind)
         before = expected_options(kind, job)
@@ -308,6 +334,31 @@ async def _revised_options(
     revised = ResolvedOptions(before, job.requested)
     if request.options:
         revised = await revise_options(kind, revised, request.options, is_resumed=is_resumed)
+    return _Retry(kind, before, revised, is_resumed)
+
+
+async def _check_retried_meshes(
+    service: Service, principal: Principal, job_id: uuid.UUID, request: RetryRequest
+) -> None:
+    """Check the meshes of a job that is to be tried again; see :func:`check_glass_meshes`."""
+    async with service.pool.connection() as connection:
+        job = await fetch_visible_job(connection, principal, job_id)
+    # Without files it has no meshes; one that waits, runs or has succeeded is not tried again.
+    if job.files_id is None or job.state not in ("failed", "canceled"):
+        return
+    if (retry := await _resolve_retry(job, request)) is not None:
+        await check_glass_meshes(service, principal, retry.kind, retry.revised.complete, job.files_id)
+
+
+async def _revised_options(
+    connection: Connection, service: Service, principal: Principal, job: Job, request: RetryRequest
+) -> rows.RevisedOptions | None:
+    """Return the checked options of a retried job; None leaves them as they are."""
+    workers = await live_workers_of_queue(connection, job.queue, service.settings.stale_seconds)
+    retry = await _resolve_retry(job, request)
+    if retry is None:
+        return None
+    kind, before, revised, is_resumed = retry.kind, retry.before, retry.revised, retry.is_resumed
     options = revised.complete
     # Also where nothing is changed: workers and limits may be others than when the job was accepted.
     check_formats_writable(kind, options, job.queue, workers)

@@ -1,29 +1,20 @@
 """Validation of a COLMAP model in a child process with limits."""
 
-import logging
-import os
-import signal
-import subprocess
 import tempfile
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pydantic import ValidationError
-
-from octasplat.engine.core.isolated_python import python_command
 from octasplat.service.intake.faults import IntakeFault
-from octasplat.service.intake.model_child import MAX_ANSWER_BYTES, ModelAnswer, ModelRequest
+from octasplat.service.intake.model_child import ModelAnswer, ModelRequest
+from octasplat.service.intake.parser_process import ParserError, run_parser
 from octasplat.workers.storage.protocol import Storage
 from octasplat.workers.storage.trees import TreeFile, fetch_tree
 from octasplat.workers.worker.memory_limit import total_memory_bytes
 
 MIN_VIEWS = 3
 """Fewer photographs do not make a scene; as in the engine."""
-
-_log = logging.getLogger(__name__)
-_LIBRARY_VARIABLES = ("PATH", "LANG", "LC_ALL", "LD_LIBRARY_PATH", "NUMBA_CACHE_DIR", "SYSTEMROOT")
+CHILD = "octasplat.service.intake.model_child"
 
 
 @dataclass(frozen=True)
@@ -87,55 +78,26 @@ def check_model(
 
 
 def _run_model_child(request: ModelRequest, limits: ModelLimits) -> ModelAnswer:
-    # Files, not pipes: the child's limit on the length of files then bounds what it can say.
-    with tempfile.TemporaryFile() as answer, tempfile.TemporaryFile() as noise:
-        child = subprocess.Popen(  # noqa: S603 - a program of ours
-            python_command("octasplat.service.intake.model_child"),
-            stdin=subprocess.PIPE,
-            stdout=answer,
-            stderr=noise,
-            env=parser_environment(),
-            start_new_session=True,
-            cwd="/",
-        )
-        try:
-            child.communicate(request.model_dump_json().encode(), timeout=limits.seconds)
-        except subprocess.TimeoutExpired:
-            return _failed_answer(
-                "model-timeout", f"Reading the COLMAP model took more than {limits.seconds} s."
-            )
-        finally:
-            with suppress(ProcessLookupError):
-                os.killpg(child.pid, signal.SIGKILL)
-            child.wait()
-        answer.seek(0)
-        text = answer.read(MAX_ANSWER_BYTES)
-        noise.seek(max(0, noise.seek(0, os.SEEK_END) - 2000))
-        output = noise.read(2000)
-    if child.returncode == -signal.SIGXCPU:
-        return _failed_answer(
-            "model-timeout",
-            f"Reading the COLMAP model took more than {limits.cpu_seconds} s of processor time.",
-        )
-    if child.returncode == -signal.SIGKILL:
-        _log.warning("the reader of a COLMAP model was killed: %a", output)
-        return _failed_answer(
-            "model-killed",
-            "The reader of the COLMAP model was killed, perhaps for want of memory; try again later.",
-        )
     try:
-        return ModelAnswer.model_validate_json(text)
-    except ValidationError:
-        _log.warning("the reader of a COLMAP model ended with %s: %a", child.returncode, output)
+        return run_parser(CHILD, request, ModelAnswer, limits.seconds)
+    except ParserError as error:
         return _failed_answer(
-            "model-crash", "The COLMAP model cannot be read (its reader crashed); write it anew with COLMAP."
+            *{
+                "time": ("model-timeout", f"Reading the COLMAP model took more than {limits.seconds} s."),
+                "cpu-time": (
+                    "model-timeout",
+                    f"Reading the COLMAP model took more than {limits.cpu_seconds} s of processor time.",
+                ),
+                "killed": (
+                    "model-killed",
+                    "The reader of the COLMAP model was killed, perhaps for want of memory; try again later.",
+                ),
+                "crash": (
+                    "model-crash",
+                    "The COLMAP model cannot be read (its reader crashed); write it anew with COLMAP.",
+                ),
+            }[error.reason]
         )
-
-
-def parser_environment() -> dict[str, str]:
-    """Return the environment of a child that parses untrusted data: library paths, no secrets."""
-    inherited = {name: os.environ[name] for name in _LIBRARY_VARIABLES if name in os.environ}
-    return {**inherited, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
 
 
 def _failed_answer(code: str, detail: str) -> ModelAnswer:

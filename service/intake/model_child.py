@@ -2,16 +2,10 @@
 
     python -P -m octasplat.service.intake.model_child < request.json > answer.json
 
-It limits its own memory, time and output, and gives up the network, other programs and writing, before it
-imports anything that parses. Only this module's ``main`` imports pycolmap. The parent is
-:mod:`octasplat.service.intake.model_check`; the request and the answer are defined here.
+It gives up rights as :mod:`octasplat.service.intake.parser_child` says. Only ``check`` imports pycolmap. The
+parent is :mod:`octasplat.service.intake.model_check`; the request and the answer are defined here.
 """
 
-import contextlib
-import os
-import resource
-import signal
-import sys
 import unicodedata
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,38 +15,28 @@ from pydantic import BaseModel
 
 from octasplat.engine.core.portable_names import FileNameError, check_name, quoted_name
 from octasplat.service.intake.faults import IntakeFault
-from octasplat.workers.sandbox.confinement import confine
-from octasplat.workers.sandbox.linux import PR_SET_PDEATHSIG, prctl
+from octasplat.service.intake.parser_child import ParserRequest, answer_request
 
 if TYPE_CHECKING:
     from octasplat.engine.dataset.colmap_model import ColmapModel
 
-MAX_ANSWER_BYTES = 4 << 20
 MAX_FAULTS = 100
 _MAX_COORDINATE = 1e12
 _UNIT_TOLERANCE = 1e-3
 
 
-class ModelRequest(BaseModel):
-    """Request to the child process that parses COLMAP models.
+class ModelRequest(ParserRequest):
+    """Request to the child process that parses COLMAP models; ``root`` holds the models.
 
     Attributes:
-        root: folder of the scene, which holds the models and nothing else.
         files: names of the models' files in the dataset, by their paths below ``root``.
         sizes_px: width and height of every photograph, by its name below ``images/``.
         min_views: fewer posed photographs do not make a scene.
-        memory_bytes: address space.
-        cpu_seconds: processor time.
-        hidden: folders that are nothing to it.
     """
 
-    root: Path
     files: dict[str, str]
     sizes_px: dict[str, tuple[int, int]]
     min_views: int
-    memory_bytes: int
-    cpu_seconds: int
-    hidden: tuple[Path, ...] = ()
 
 
 class ModelAnswer(BaseModel):
@@ -68,17 +52,14 @@ class ModelAnswer(BaseModel):
 
 def main() -> None:
     """Read the request from stdin, parse the model, and write the answer to stdout."""
-    answer_fd = os.dup(1)
-    os.dup2(2, 1)  # libraries that talk do so to stderr
-    request = ModelRequest.model_validate_json(sys.stdin.buffer.read())
-    _enter_sandbox(request)
+    answer_request(ModelRequest, _check_within_memory)
+
+
+def _check_within_memory(request: ModelRequest) -> ModelAnswer:
     try:
-        answer = check(request)
+        return check(request)
     except MemoryError:
-        answer = _fault_answer("model-memory", "The COLMAP model takes too much memory to read.")
-    text = answer.model_dump_json().encode()
-    with os.fdopen(answer_fd, "wb") as out:
-        out.write(text)
+        return _fault_answer("model-memory", "The COLMAP model takes too much memory to read.")
 
 
 def check(request: ModelRequest) -> ModelAnswer:
@@ -106,7 +87,7 @@ def check(request: ModelRequest) -> ModelAnswer:
         model = colmap_model_of(loaded, folder)
     except DatasetError as error:
         return _fault_answer(
-            "model-damaged", _without_root(str(error), request.root), _file_in_sentence(str(error), request)
+            "model-damaged", request.without_root(str(error)), _file_in_sentence(str(error), request)
         )
     return checker.summary(model)
 
@@ -211,7 +192,7 @@ class _ModelChecker:
     def summary(self, model: "ColmapModel") -> ModelAnswer:
         """Return the answer for a model without faults."""
         posed = {unicodedata.normalize("NFC", image.name) for image in model.images}
-        warnings = [_without_root(warning, self.request.root) for warning in model.warnings]
+        warnings = [self.request.without_root(warning) for warning in model.warnings]
         unposed = len(self._sizes) - len(posed)
         if unposed:
             warnings.append(f"{unposed} photographs have no pose in the COLMAP model and are left out.")
@@ -249,28 +230,6 @@ def _model_file(stem: str, request: ModelRequest) -> str | None:
 
 def _file_in_sentence(sentence: str, request: ModelRequest) -> str | None:
     return next((name for name in request.files.values() if name in sentence), None)
-
-
-def _without_root(sentence: str, root: Path) -> str:
-    """Return the sentence without the folder of this machine that holds the model."""
-    return sentence.replace(f"{root}/", "").replace(str(root), "the dataset")
-
-
-def _enter_sandbox(request: ModelRequest) -> None:
-    """Give up rights that a parser does not need, for good."""
-    # The parent ends it where it takes too long, unless it was killed itself.
-    with contextlib.suppress(OSError):
-        prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    for kind, soft, hard in (
-        (resource.RLIMIT_AS, request.memory_bytes, request.memory_bytes),
-        # At the soft limit SIGXCPU comes, which the parent can tell from a SIGKILL for other reasons.
-        (resource.RLIMIT_CPU, request.cpu_seconds, request.cpu_seconds + 1),
-        (resource.RLIMIT_FSIZE, MAX_ANSWER_BYTES, MAX_ANSWER_BYTES),
-        (resource.RLIMIT_CORE, 0, 0),
-    ):
-        with contextlib.suppress(ValueError):  # already lower
-            resource.setrlimit(kind, (soft, hard))
-    confine(hidden=request.hidden, readable=(request.root,), may_start_processes=False)
 
 
 if __name__ == "__main__":

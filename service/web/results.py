@@ -169,9 +169,11 @@ def read_measurements(
     results = {row.name for row in artifacts}
     files = {file.path for file in photographs}
     views = []
-    # The name of a render depends on all photographs, as two may differ by their suffix alone.
-    for (name, row), rendered in zip(rows.items(), unique_render_names(list(rows)), strict=True):
-        render = f"renders/{rendered}.png"
+    for name, row in rows.items():
+        (rendered,) = unique_render_names([name])
+        # Photographs that were trained on are not listed, and one may differ by its suffix alone.
+        names = (f"renders/{rendered}.png", f"renders/{name}.png")
+        render = next((found for found in names if found in results), names[0])
         photograph = f"images/{name}"
         has_photograph = photograph in files and PurePosixPath(name).suffix.lower() in _BROWSER_IMAGE_SUFFIXES
         views.append(

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from octasplat.engine.core.scene_layout import FileRole
 from octasplat.service.intake.dataset import DatasetFile, DatasetLimits, DatasetSummary, check_dataset
 from octasplat.service.intake.faults import IntakeError, IntakeFault
-from octasplat.service.intake.model_check import ModelLimits, check_model, parser_environment
+from octasplat.service.intake.model_check import ModelLimits, check_model
+from octasplat.service.intake.parser_process import parser_environment
 from octasplat.service.intake.upload_names import check_file_name
 from octasplat.workers.storage.local import LocalStorage
 from octasplat.workers.storage.trees import TreeFile

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from octasplat.service.intake import model_check
+from octasplat.service.intake import parser_process
 from octasplat.service.intake.model_check import ModelLimits, check_model
 from octasplat.workers.storage.local import LocalStorage
 
@@ -20,6 +20,6 @@ def test_killed_reader_is_no_matter_of_processor_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     command = [sys.executable, "-c", "import os, signal; os.kill(os.getpid(), signal.SIGKILL)"]
-    monkeypatch.setattr(model_check, "python_command", lambda _module: command)
+    monkeypatch.setattr(parser_process, "python_command", lambda _module: command)
     (fault,) = check_model(LocalStorage(tmp_path, floor_bytes=0), [], {}).faults
     assert fault.code == "model-killed" and "processor time" not in fault.detail

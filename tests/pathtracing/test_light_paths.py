@@ -7,7 +7,8 @@ import pytest
 
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.pathtracing.compile_meshes import check_outside_glass, compile_meshes
-from octasplat.engine.pathtracing.mesh_shapes import MeshShape, primitive_shape, turn_outwards
+from octasplat.engine.pathtracing.mesh_files import MeshShape
+from octasplat.engine.pathtracing.mesh_shapes import primitive_shape, turn_outwards
 from octasplat.engine.pathtracing.path_tracer import PathTracer, PathTracerScene
 from octasplat.engine.pathtracing.stage.materials import Dielectric, Diffuse, Glass, Metal, Mirror
 from octasplat.engine.pathtracing.stage.model import (

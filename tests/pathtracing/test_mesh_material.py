@@ -13,7 +13,8 @@ from octasplat.engine.core.color import linear_to_srgb
 from octasplat.engine.core.errors import OctasplatError
 from octasplat.engine.files import glb_container
 from octasplat.engine.pathtracing.compile_meshes import compile_meshes
-from octasplat.engine.pathtracing.mesh_shapes import MeshShape, primitive_shape
+from octasplat.engine.pathtracing.mesh_files import MeshShape
+from octasplat.engine.pathtracing.mesh_shapes import primitive_shape
 from octasplat.engine.pathtracing.stage.materials import Diffuse, Glass, Material, MetallicRoughness
 from octasplat.engine.pathtracing.stage.model import (
     Integrator,

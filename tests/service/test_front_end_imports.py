@@ -56,6 +56,19 @@ answer = check(ModelRequest(
 assert not answer.faults and answer.views == 4, answer
 """
 )
+CHECK_GLASS = (
+    BLOCK
+    + """
+from pathlib import Path
+from octasplat.engine.pathtracing.stage.model import StageMesh
+from octasplat.service.intake.mesh_child import MeshRequest, check
+root = Path(sys.argv[1])
+(root / "leaf.obj").write_text("v 0 0 0\\nv 1 0 0\\nv 0 1 0\\nf 1 2 3\\n")
+leaf = StageMesh(file="leaf.obj", material={"kind": "glass"})
+answer = check(MeshRequest(root=root, meshes={0: leaf}, memory_bytes=1 << 40, cpu_seconds=600))
+assert answer.faults[0].startswith("meshes[0]: leaf.obj is not closed (3 edges"), answer
+"""
+)
 ACCEPT = (
     BLOCK
     + """
@@ -85,6 +98,10 @@ def test_front_end_checks_models_without_engine_packages(tmp_path: Path) -> None
     config = SyntheticDatasetConfig(views=4, width_px=48, height_px=36, samples_per_side=1, points=100)
     write_synthetic_dataset(tmp_path / "scene", config)
     run_where_little_is_installed(CHECK, str(tmp_path / "scene"))
+
+
+def test_front_end_checks_meshes_without_engine_packages(tmp_path: Path) -> None:
+    run_where_little_is_installed(CHECK_GLASS, str(tmp_path))
 
 
 def test_front_end_accepts_jobs_without_engine_packages() -> None:

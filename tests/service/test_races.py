@@ -1,6 +1,7 @@
 """Requests that meet each other get an answer that fits, never a fault of the service."""
 
 import asyncio
+import uuid
 
 import httpx
 import pytest
@@ -14,6 +15,7 @@ from tests.support.service_harness import (
     ConnectService,
     claim_job,
     committed_dataset,
+    new_job,
     store_content,
 )
 
@@ -104,3 +106,36 @@ async def test_ranges_with_thousands_of_digits(
         await conversation(http, service)
     async with connect_service() as (http, service):
         await conversation(http, service)
+
+
+async def test_retry_locks_blocks_before_their_job(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
+        job = await new_job(http, service)
+        await (await claim_job(service, job)).fail({"type": "x", "message": "x."})
+        block = uuid.uuid4()
+        async with service.pool.connection() as connection:
+            await connection.execute(
+                """
+                INSERT INTO jobs (id, owner, kind, dataset_id, options, queue, state, root_id, role)
+                SELECT %s, owner, kind, dataset_id, '{"number": 1}', queue, 'succeeded', id, 'block' FROM jobs
+                WHERE id = %s
+                """,
+                [block, job["id"]],
+            )
+        lock = "SELECT id FROM jobs WHERE id = %s FOR UPDATE"
+        async with service.pool.connection() as other, other.transaction():
+            await other.execute(lock, [block])  # as a request to cancel the job does first
+            retry = asyncio.create_task(http.post(f"/v1/jobs/{job['id']}/retry"))
+            while not await is_waited_for(service, other.info.backend_pid):
+                assert not retry.done(), (await retry).text
+                await other.execute("SELECT pg_sleep(0.05)")
+            await other.execute(f"{lock} NOWAIT", [job["id"]])
+        answer = await retry
+        assert answer.status_code == 202, answer.text
+
+
+async def is_waited_for(service: Service, pid: int) -> bool:
+    """Whether a process of the database waits for a lock of another."""
+    async with service.pool.connection() as connection:
+        query = "SELECT 1 FROM pg_stat_activity WHERE %s = ANY(pg_blocking_pids(pid))"
+        return await (await connection.execute(query, [pid])).fetchone() is not None

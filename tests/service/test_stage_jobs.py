@@ -136,6 +136,18 @@ async def test_invalid_stage_problem_names_key(connect_service: ConnectService) 
         assert (await http.get("/v1/jobs", params={"kind": "render"})).json()["jobs"] == []
 
 
+async def test_preview_counts_as_one_image(connect_service: ConnectService) -> None:
+    one_image = 48 * 36
+    async with connect_service(max_render_pixels=one_image) as (http, service):
+        source = await finished(http, service, {"scene.ply": b"ply"})
+        options = {"mode": "views", "views": "all", "format": "png", "stage": "[[meshes]]\nshape = 'cube'"}
+        body = {"kind": "render", "source_id": source}
+        whole = await http.post("/v1/jobs", json={**body, "options": options})
+        assert (whole.status_code, whole.json()["type"]) == (422, "urn:octasplat:problem:ceiling")
+        preview = await http.post("/v1/jobs", json={**body, "options": {**options, "preview": True}})
+        assert preview.status_code == 202, preview.text
+
+
 async def test_stage_files_are_checked_on_upload(connect_service: ConnectService) -> None:
     async with connect_service() as (http, service):
         dataset = (await http.post("/v1/datasets", json={"holds": "files"})).json()["id"]

@@ -10,6 +10,7 @@ import uuid
 
 import pytest
 
+from octasplat.engine.render.file_names import unique_render_names
 from octasplat.service.web import formatting
 from octasplat.service.web.results import download_groups, read_measurements, viewable_mesh
 from octasplat.service.web.routing import safe_local_path
@@ -261,6 +262,16 @@ def test_views_are_worst_first_and_odd_figures_do_no_harm() -> None:
     assert (
         read_measurements({}, [], []) is None and read_measurements({"mean": [1], "views": 3}, [], []) is None
     )
+
+
+def test_view_with_the_stem_of_a_trained_one_has_its_render() -> None:
+    assert unique_render_names(["s/a.jpg", "s/a.png", "b.jpg"]) == ("s/a.jpg", "s/a.png", "b")
+    metrics = {"mean": {"psnr": 25.0}, "views": {"s/a.jpg": {"psnr": 1.0}, "b.jpg": {"psnr": 2.0}}}
+    names = ["renders/s/a.jpg.png", "renders/b.png", "layers/normal/s/a.jpg.png"]
+    found = read_measurements(metrics, [artifact(name) for name in names], [])
+    assert found is not None
+    assert [view.render for view in found.views] == names[:2]
+    assert found.views[0].layers == {"normal": names[2]}
 
 
 def test_same_stem_views_have_own_renders() -> None:

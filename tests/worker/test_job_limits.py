@@ -40,6 +40,16 @@ def test_job_time_limit_fails_and_retry_restarts_clock(bench: WorkerHarness) -> 
     assert again.checkpoint is not None and again.checkpoint["step"] > job.checkpoint["step"]
 
 
+def test_job_that_is_done_before_it_stops_for_its_time_succeeds(bench: WorkerHarness) -> None:
+    bench.worker(MAX_JOB_HOURS=str(1 / 3600), GRACE_SECONDS="120")
+    job_id = bench.submit(options=bench.wait_until_held(deaf=True))
+    bench.wait(job_id, lambda _job: "does not heed" in bench.log(job_id))
+    bench.open_gate()
+    job = bench.wait_until_finished(job_id)
+    assert job.state == "succeeded" and job.error is None
+    assert bench.results(job_id)["sum.txt"] == str(sum(range(61))).encode()
+
+
 def test_memory_is_shared_out_by_default(bench: WorkerHarness) -> None:
     bench.worker(queues="cpu=2")
     bench.wait_until_up("w")

@@ -10,9 +10,13 @@ from octasplat.engine.core.errors import ConfigError, OctasplatError
 from octasplat.engine.core.events import EventListener, Noted, Warned, ignore_events
 from octasplat.engine.core.portable_names import name_or
 from octasplat.engine.core.progress import counted_phase
-from octasplat.engine.pathtracing.stage.materials import Glass
 from octasplat.engine.pathtracing.stage.sidecar_files import sidecar_files
-from octasplat.engine.pathtracing.stage.stage_file import read_stage, referenced_files, with_renamed_files
+from octasplat.engine.pathtracing.stage.stage_file import (
+    glass_meshes,
+    read_stage,
+    referenced_files,
+    with_renamed_files,
+)
 from octasplat.engine.render.path_document import read_path_document
 from octasplat.engine.settings.nested_options import merge_options
 from octasplat.workers.client.api import Api
@@ -116,11 +120,11 @@ def with_stage(derivation: Derivation, stage: Path) -> Derivation:
         SceneFileError: a mesh that is to be glass cannot be read.
     """
     read = read_stage(stage)
-    if any(mesh.file is not None and isinstance(mesh.material, Glass) for mesh in read.meshes):
-        # Its kernels take a second to load, which other stages do not need.
-        from octasplat.engine.pathtracing.compile_meshes import check_glass_is_closed
+    if glass := glass_meshes(read):
+        # The readers of meshes take a while to import, which other stages do not need.
+        from octasplat.engine.pathtracing.mesh_files import check_glass_is_closed
 
-        check_glass_is_closed(read, stage.parent)
+        check_glass_is_closed(glass, stage.parent)
     names: dict[str, str] = {}
     for _, name in referenced_files(read):
         names[name] = name_or(name, f"elsewhere/{len(names)}/{Path(name).name}")

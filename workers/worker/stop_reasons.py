@@ -29,6 +29,11 @@ class StopReason(Enum):
     HIDDEN_FILES = "its folder could not be measured"
     UNWATCHED = "its limits could not be watched any more"
 
+    @property
+    def gives_time(self) -> bool:
+        """Return whether the process may stop by itself, and so may have ended its work before."""
+        return self in (StopReason.CANCELED, StopReason.DRAINING, StopReason.TIME_LIMIT)
+
 
 async def disk_stop_reason(
     context: WorkerContext, workspace: Workspace, job_id: uuid.UUID, executor: Executor

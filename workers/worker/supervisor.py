@@ -139,7 +139,7 @@ class Supervisor:
         if self._stop_reason not in (StopReason.FENCED, StopReason.DATABASE_LOST):
             await self._reporter.finish()
         # A program that was done before it heard of the wish to stop has succeeded.
-        if code == 0 and self._stop_reason in (None, StopReason.CANCELED, StopReason.DRAINING):
+        if code == 0 and (self._stop_reason is None or self._stop_reason.gives_time):
             planned = self._reporter.blocks_planned
             if planned is not None and kind.block_kind:
                 await self._outcomes.start_blocks(planned, kind, task["options"])

@@ -11,7 +11,8 @@ from pydantic import ValidationError
 
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.writing import write_text
-from octasplat.engine.pathtracing.stage.model import Stage
+from octasplat.engine.pathtracing.stage.materials import Glass
+from octasplat.engine.pathtracing.stage.model import Stage, StageMesh
 from octasplat.engine.pathtracing.stage.sidecar_files import sidecar_files
 from octasplat.engine.pathtracing.stage.stage_errors import stage_error
 
@@ -80,6 +81,15 @@ def referenced_files(stage: Stage) -> Iterator[tuple[str, str]]:
             texture = getattr(mesh.material, key, None)
             if texture is not None:
                 yield f"meshes[{number}].material.{key}", texture
+
+
+def glass_meshes(stage: Stage) -> dict[int, StageMesh]:
+    """Return the meshes of files that are to be glass, and so must be closed, by their numbers."""
+    return {
+        number: mesh
+        for number, mesh in enumerate(stage.meshes)
+        if mesh.file is not None and isinstance(mesh.material, Glass)
+    }
 
 
 def stage_identity(stage: Stage, folder: Path) -> tuple[object, ...]:

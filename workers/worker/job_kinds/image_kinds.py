@@ -1,6 +1,6 @@
 """Kinds of jobs that render images: new views, and other light."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,8 @@ from octasplat.engine.operations.cost_model import (
 )
 from octasplat.engine.operations.relight import RelightOptions
 from octasplat.engine.operations.render import RenderOptions
-from octasplat.engine.pathtracing.stage.stage_file import referenced_files
+from octasplat.engine.pathtracing.stage.model import StageMesh
+from octasplat.engine.pathtracing.stage.stage_file import glass_meshes, referenced_files
 from octasplat.workers.worker.frame_checkpoints import FrameCheckpoints
 from octasplat.workers.worker.job_kinds.operation_kind import OperationKind
 from octasplat.workers.worker.job_kinds.resource_limits import ResourceDemand
@@ -77,6 +78,10 @@ class RenderKind(ImageKind):
         """Return the files of the stage."""
         for key, name in referenced_files(options.stage) if options.stage is not None else ():
             yield f"stage.{key.replace('[', '.').replace(']', '')}", name
+
+    def glass_meshes(self, options: RenderOptions) -> Mapping[int, StageMesh]:
+        """Return the meshes of the stage that are to be glass."""
+        return {} if options.stage is None else glass_meshes(options.stage)
 
     def request_paths(self, task: Task, options: Any) -> dict[str, Any]:
         """Return where a job reads and writes, the stage's files among them.

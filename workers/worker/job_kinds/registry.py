@@ -16,6 +16,7 @@ from octasplat.workers.worker.job_kinds.resource_limits import ResourceDemand
 
 if TYPE_CHECKING:
     from octasplat.engine.operations.cost_model import Estimate
+    from octasplat.engine.pathtracing.stage.model import StageMesh
 
 OptionsT = TypeVar("OptionsT", bound=BaseModel, default=Any)
 
@@ -158,6 +159,10 @@ class JobKind(Generic[OptionsT]):
     def named_files(self, options: OptionsT) -> Iterable[tuple[str, str]]:
         """Return the files that the options name, each after the place where they do, with dots."""
         return ()
+
+    def glass_meshes(self, options: OptionsT) -> "Mapping[int, StageMesh]":
+        """Return the meshes of files that must be closed, by their numbers in ``stage.meshes``."""
+        return {}
 
     def options_of_block(self, options: OptionsT, number: int, iterations: int, plan: str) -> dict[str, Any]:
         """Return the options of the job of a block, as JSON values.
