@@ -1,7 +1,7 @@
 """The folder of a run: claimed before the work, and released if the work is refused."""
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -108,12 +108,22 @@ def _is_from_pose_search(poses: Path) -> bool:
     return "photographs_sha256" in read_pose_record(poses)
 
 
-def write_config(scene: Path, output: Path, config: ReconstructionConfig) -> None:
-    """Write ``config.json``: the photographs' place, all settings, and the versions of the software."""
+def write_config(
+    scene: Path, output: Path, config: ReconstructionConfig, decided: Mapping[str, str] | None = None
+) -> None:
+    """Write ``config.json``: the photographs' place, all settings, and the versions of the software.
+
+    Args:
+        scene: folder of the photographs.
+        output: the folder.
+        config: all settings.
+        decided: what the run has decided by itself, by name.
+    """
     content = {
         "scene": str(scene.resolve()),
         "reconstruction": config.model_dump(mode="json"),
         "versions": package_versions(),
+        **(decided or {}),
     }
     write_json(output / CONFIG, content)
 

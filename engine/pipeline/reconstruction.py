@@ -13,6 +13,7 @@ from octasplat.engine.files import check_writable
 from octasplat.engine.pipeline.block_request import BlockRequest, keep_request
 from octasplat.engine.pipeline.block_steps import TrainBlock
 from octasplat.engine.pipeline.dataset_steps import FindPoses, OpenBlockPhotographs, OpenDataset
+from octasplat.engine.pipeline.material_choice import with_recorded_choice
 from octasplat.engine.pipeline.output_folder import claim_output, release_on_refusal
 from octasplat.engine.pipeline.result_steps import EvaluateStep, ExportStep
 from octasplat.engine.pipeline.run import OnStep, ReconstructionRun, Step, run_steps
@@ -84,6 +85,7 @@ def reconstruct(
         require_blocks_possible(config)
     use_threads(threads)
     config, found_by = config.without_run_of_model()
+    config = with_recorded_choice(output, config)
     # before the claim, which makes the folder
     is_made, is_new = not output.exists(), claim_output(scene, output, config, resume)
     with lock_run_folder(output):

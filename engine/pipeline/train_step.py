@@ -1,5 +1,6 @@
 """The training step: its result is the scene, and what the training learnt beside it."""
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from octasplat.engine.gaussians.materials import reflective_fraction
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.scene_metadata import SceneMetadata
 from octasplat.engine.pipeline.block_steps import count_blocks, train_all_blocks
+from octasplat.engine.pipeline.material_choice import choose_materials
 from octasplat.engine.pipeline.run import ReconstructionRun
 from octasplat.engine.pipeline.start_scene import has_start, started_state
 from octasplat.engine.render.environment_files import write_background_map, write_environment
@@ -42,17 +44,12 @@ from octasplat.engine.train.loop.checkpoint import load_latest_checkpoint, run_f
 from octasplat.engine.train.loop.state import MinScale, TrainState
 from octasplat.engine.train.loop.time_budget import make_plan, read_plan, write_plan
 from octasplat.engine.train.loop.trainer import Trainer
-from octasplat.engine.train.loop.trial_training import MATERIAL_TRIAL_RAYS, material_gain_db
 from octasplat.engine.train.sampling.pixel_sampler import valid_pixel_fraction
 from octasplat.engine.train.shading_factory import find_background, find_deferred, find_exposures
 from octasplat.engine.train.views.exposure_changes import resolve_exposure
 
 MIN_REFLECTIVE_SHARE = 0.01
 """Share of the surface that must reflect for materials and the environment to be more than guesses."""
-LONG_TRAINING_TRIALS = 8
-"""Trainings of less than so many times the rays of a trial are begun without one."""
-MAX_MATERIAL_LOSS_DB = 1.0
-"""Loss of a trial above which materials are warned of."""
 
 
 class TrainStep:
@@ -66,13 +63,17 @@ class TrainStep:
 
     def __call__(self, run: ReconstructionRun) -> None:
         """Train, and write the scene after everything else."""
+        began = time.perf_counter()
+        if not any((run.output / CHECKPOINTS).glob("*.npz")):
+            choose_materials(run)  # before the plan, which shares out what is left of the time
         dataset, config = run.dataset, run.config
-        steps = 0
+        steps, choosing_s = 0, time.perf_counter() - began
         if not config.minutes:
             steps = iteration_count(
                 run.train_config, dataset.train_pixel_count, valid_pixel_fraction(dataset)
             )
         with phase("train", run.progress, steps) as clock:
+            clock.add(choosing_s)
             gaussians = _train(run, clock)
             facts = SceneMetadata(
                 near_world=dataset.near_world,
@@ -86,8 +87,6 @@ class TrainStep:
 def _train(run: ReconstructionRun, clock: PhaseClock) -> FlatGaussians:
     if (count := count_blocks(run)) > 1:
         return _train_in_blocks(run, count)
-    if not any((run.output / CHECKPOINTS).glob("*.npz")):
-        _warn_of_useless_materials(run)  # before the plan, which shares out what is left of the time
     config = _plan_settings(run, clock)
     nearest_world = camera_clearances(run.dataset.viewpoints, run.dataset.points)
     trainer = _make_trainer(run, config, nearest_world, clock)
@@ -168,39 +167,6 @@ def _region_text(dataset: Dataset, trained_pixels: Rectangles) -> str:
         f"The region is seen by {seeing / 1e6:.1f} of {chosen.pixel_count / 1e6:.1f} million pixels; the "
         f"others are drawn {FULL_FREQUENCY // OUTSIDE_FREQUENCY} times less often."
     )
-
-
-def _warn_of_useless_materials(run: ReconstructionRun) -> None:
-    """Warn before a long training whose photographs plain colors explain better than materials do."""
-    config = run.train_config
-    steps = iteration_count(config, run.dataset.train_pixel_count, valid_pixel_fraction(run.dataset))
-    if (
-        not config.materials.learn
-        or steps * config.rays_per_batch < LONG_TRAINING_TRIALS * MATERIAL_TRIAL_RAYS
-    ):
-        return
-    run.progress(Noted("Two short trainings show first whether materials explain these photographs."))
-    gain_db = material_gain_db(
-        run.dataset,
-        recipe=config.materials.recipe,
-        background=config.background,
-        seed=config.seed,
-        threads=run.threads,
-        should_stop=run.should_stop,
-    )
-    if gain_db < -MAX_MATERIAL_LOSS_DB:
-        advice = (
-            ""
-            if config.materials.recipe == "near_field"
-            else " For something shiny in a room there is --set materials.recipe=near_field."
-        )
-        run.progress(
-            Warned(
-                f"In a short training new views are {-gain_db:.1f} dB worse with materials than without: "
-                "little here reflects its surroundings clearly, or they are near. Leave out --materials "
-                f"unless the scene is to be lit anew.{advice}"
-            )
-        )
 
 
 def _prunes_unseen(materials: MaterialSettings) -> bool:

@@ -27,6 +27,7 @@ class MaterialSettings(Settings):
     """Settings of learnt materials and environments; shares of the training are of all its iterations."""
 
     former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.MATERIALS
+    later_settings: ClassVar[frozenset[str]] = frozenset({"fallback"})
 
     learn: Annotated[bool, ADVANCED] = Field(
         False,
@@ -41,6 +42,12 @@ class MaterialSettings(Settings):
         "values, visibility is yes or no, and materials start over when deferred shading "
         "begins. near_field is for rooms: only what reflects is shaded, and mirrors the harmonics of what "
         "stands around it.",
+    )
+    fallback: Annotated[bool | None, ADVANCED] = Field(
+        None,
+        description="Before a long training by the recipe split_sum, short ones show whether materials "
+        "explain the photographs. Where they lose much to plain colors, the recipe near_field is used if it "
+        "gains, and no materials are learnt otherwise; false learns them all the same.",
     )
     up_world: Annotated[tuple[float, float, float], Unit("world direction"), ADVANCED] = Field(
         (0.0, 0.0, 1.0),

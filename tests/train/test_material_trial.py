@@ -1,15 +1,18 @@
 """Whether materials are of use is judged by two short trainings, before a long one."""
 
+import shutil
 import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.events import Event, Noted, Warned
 from octasplat.engine.dataset import Dataset
-from octasplat.engine.pipeline import reconstruct, train_step
-from octasplat.engine.runs.config import resolve_config
+from octasplat.engine.files.gaussian_ply import read_gaussian_ply
+from octasplat.engine.pipeline import material_choice, reconstruct, train_step
+from octasplat.engine.runs.config import read_config, resolve_config
 from octasplat.engine.train.loop import trial_training
 from octasplat.engine.train.loop.time_budget import TimeBudgetPlan, make_plan
 from octasplat.engine.train.loop.trial_training import material_gain_db
@@ -39,30 +42,111 @@ def test_materials_of_matt_things_lose_accuracy(
     assert material_gain_db(dataset, background="black", seed=0, threads=2) < -1.0
 
 
-@pytest.mark.exhaustive
-@pytest.mark.parametrize(
-    ("gain_db", "share", "told"),
-    [
-        (-4.0, 0, 1),
-        pytest.param(0.5, 0, 0, marks=pytest.mark.exhaustive),
-        pytest.param(-4.0, 10**9, 0, marks=pytest.mark.exhaustive),
-    ],
-)
-def test_long_training_with_useless_materials_is_warned_of(
-    few_pixels: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gain_db: float, share: int, told: int
-) -> None:
-    monkeypatch.setattr(train_step, "material_gain_db", lambda *_arguments, **_named: gain_db)
-    monkeypatch.setattr(train_step, "LONG_TRAINING_TRIALS", share)
+FEW = ["iterations=2", "rays_per_batch=64", "initial_points=50", "max_gaussians=100", "test_every=4"]
+TRIALS = "short trainings"
+
+
+def gains(monkeypatch: pytest.MonkeyPatch, far_db: float, near_db: float = 0.0) -> list[str]:
+    """Let trials have gains; return the list that their recipes are added to."""
+    tried: list[str] = []
+
+    def gain_db(*_arguments: object, recipe: str, **_named: object) -> float:
+        tried.append(recipe)
+        return near_db if recipe == "near_field" else far_db
+
+    monkeypatch.setattr(material_choice, "material_gain_db", gain_db)
+    monkeypatch.setattr(material_choice, "LONG_TRAINING_TRIALS", 0)
+    return tried
+
+
+def run_few(scene: Path, output: Path, *more: str, resume: bool = False) -> tuple[list[str], list[str]]:
+    """Run a training of two iterations with materials; return its warnings and notes."""
     events: list[Event] = []
-    few = ["iterations=2", "rays_per_batch=64", "initial_points=50", "max_gaussians=100", "test_every=4"]
-    config = resolve_config("fast", settings={"exports": ()}, materials=True, assignments=few)
-    reconstruct(few_pixels, tmp_path / "run", config, threads=1, progress=events.append)
+    config = resolve_config("fast", settings={"exports": ()}, materials=True, assignments=[*FEW, *more])
+    reconstruct(scene, output, config, threads=1, progress=events.append, resume=resume)
     warned = [event.message for event in events if isinstance(event, Warned)]
-    assert sum("4.0 dB worse with materials than without" in message for message in warned) == told
-    assert sum("materials.recipe=near_field" in message for message in warned) == told
-    assert any(isinstance(event, Noted) and "short trainings" in event.message for event in events) == (
-        share == 0
-    )
+    return warned, [event.message for event in events if isinstance(event, Noted)]
+
+
+def learnt(output: Path) -> tuple[bool, str, bool]:
+    """Return whether a run has learnt materials, by which recipe, and whether its scene has them."""
+    materials = read_config(output / "config.json").train.materials
+    return materials.learn, materials.recipe, "albedo" in read_gaussian_ply(output / "scene.ply")[0].channels
+
+
+@pytest.mark.parametrize(
+    ("far_db", "near_db", "expected", "sentence"),
+    [
+        (-7.0, -1.5, (False, "split_sum", False), "The scene is trained without materials"),
+        pytest.param(
+            -7.0, 1.5, (True, "near_field", True), "1.5 dB better with materials.recipe=near_field",
+            marks=pytest.mark.exhaustive,
+        ),
+        pytest.param(
+            -1.5, 9.0, (True, "split_sum", True), "there is --set materials.recipe=near_field",
+            marks=pytest.mark.exhaustive,
+        ),
+        pytest.param(0.5, 9.0, (True, "split_sum", True), "", marks=pytest.mark.exhaustive),
+    ],
+)  # fmt: skip
+def test_long_training_learns_what_explains_the_photographs(
+    few_pixels: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, far_db, near_db, expected, sentence
+) -> None:
+    tried = gains(monkeypatch, far_db, near_db)
+    warned, noted = run_few(few_pixels, tmp_path / "run")
+    assert any(TRIALS in message for message in noted)
+    assert learnt(tmp_path / "run") == expected
+    loss = f"{-far_db:.1f} dB worse with materials than without"
+    assert sum(loss in message and sentence in message for message in warned) == (far_db < -1)
+    assert tried == (["split_sum", "near_field"] if far_db < -2.5 else ["split_sum"])
+
+
+@pytest.mark.exhaustive
+def test_choice_stays_when_the_run_goes_on(
+    few_pixels: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    output = tmp_path / "run"
+    tried = gains(monkeypatch, -7.0, -1.0)
+    run_few(few_pixels, output)
+    scene = (output / "scene.ply").read_bytes()
+    shutil.rmtree(output / "checkpoints")
+    (output / "scene.ply").unlink()
+    tried.clear()
+    run_few(few_pixels, output, resume=True)
+    assert (output / "scene.ply").read_bytes() == scene
+    assert tried == []
+    moved = tmp_path / "moved"
+    few_pixels.rename(moved)  # its place is written anew, and the choice with it
+    try:
+        run_few(moved, output, resume=True)
+    finally:
+        moved.rename(few_pixels)
+    assert learnt(output) == (False, "split_sum", False)
+    with pytest.raises(ConfigError, match="other settings"):
+        run_few(few_pixels, output, "materials.fallback=false", resume=True)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("given", ["materials.fallback=false", "materials.recipe=near_field"])
+def test_what_is_asked_for_by_name_is_learnt_and_warned_of(
+    few_pixels: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: str
+) -> None:
+    gains(monkeypatch, -7.0, -3.0)
+    warned, _ = run_few(few_pixels, tmp_path / "run", given)
+    assert sum("dB worse with materials than without" in message for message in warned) == 1
+    recipe = "near_field" if "near_field" in given else "split_sum"
+    assert learnt(tmp_path / "run") == (True, recipe, True)
+
+
+@pytest.mark.exhaustive
+def test_short_training_is_begun_without_a_trial(
+    few_pixels: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gains(monkeypatch, -7.0)
+    monkeypatch.setattr(material_choice, "LONG_TRAINING_TRIALS", 10**9)
+    warned, noted = run_few(few_pixels, tmp_path / "run")
+    assert not any(TRIALS in message for message in noted)
+    assert not any("worse with materials" in message for message in warned)
 
 
 @pytest.mark.exhaustive
@@ -81,8 +165,8 @@ def test_time_of_the_trial_is_part_of_the_minutes(
         plan = planned(*arguments, **named)
         return plan.model_copy(update={"iterations": 2, "max_gaussians": 100})
 
-    monkeypatch.setattr(train_step, "material_gain_db", slow_trial)
-    monkeypatch.setattr(train_step, "LONG_TRAINING_TRIALS", 0)
+    monkeypatch.setattr(material_choice, "material_gain_db", slow_trial)
+    monkeypatch.setattr(material_choice, "LONG_TRAINING_TRIALS", 0)
     monkeypatch.setattr(train_step, "make_plan", note)
     few = ["rays_per_batch=64", "initial_points=50", "test_every=4"]
     settings = {"exports": (), "minutes": 0.5}

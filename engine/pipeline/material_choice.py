@@ -1,0 +1,150 @@
+"""Whether a run learns materials, and by which recipe: judged by short trainings before a long one."""
+
+import json
+from pathlib import Path
+from typing import Literal, get_args
+
+from octasplat.engine.core.events import Noted, Warned
+from octasplat.engine.pipeline.output_folder import write_config
+from octasplat.engine.pipeline.run import ReconstructionRun
+from octasplat.engine.pipeline.start_scene import has_start
+from octasplat.engine.runs.config import ReconstructionConfig, revise_config
+from octasplat.engine.runs.run_folder import CONFIG
+from octasplat.engine.shading.material_settings import Recipe
+from octasplat.engine.train.config import iteration_count
+from octasplat.engine.train.loop.trial_training import MATERIAL_TRIAL_RAYS, material_gain_db
+from octasplat.engine.train.sampling.pixel_sampler import valid_pixel_fraction
+
+MaterialChoice = Literal["split_sum", "near_field", "none"]
+"""What a run learns: materials in far light, mirrors of what stands near, or no materials."""
+CHOICE_KEY = "material_choice"
+"""Of ``config.json``, where a run has chosen."""
+LONG_TRAINING_TRIALS = 8
+"""Trainings of less than so many times the rays of a trial are begun without one."""
+MAX_MATERIAL_LOSS_DB = 1.0
+"""Loss of a trial above which materials are warned of."""
+MAX_FAR_LIGHT_LOSS_DB = 2.5
+"""Loss of a trial in far light above which other ways are tried."""
+MIN_NEAR_FIELD_GAIN_DB = 0.5
+"""Gain of a trial from which on what reflects mirrors what stands near."""
+
+
+def apply_choice(config: ReconstructionConfig, choice: MaterialChoice) -> ReconstructionConfig:
+    """Return the settings of a run that asked for materials, with what was chosen.
+
+    Example:
+        >>> from octasplat.engine.runs.config import resolve_config
+        >>> apply_choice(resolve_config("fast", materials=True), "none") == resolve_config("fast")
+        True
+    """
+    if choice == "split_sum":
+        return config
+    before = config.model_dump(mode="json")
+    if choice == "near_field":
+        return revise_config(before, train={"materials": {"recipe": choice}})
+    # a term of materials alone, which would be refused
+    return revise_config(before, materials=False, train={"loss": {"edges": None}})
+
+
+def with_recorded_choice(output: Path, config: ReconstructionConfig) -> ReconstructionConfig:
+    """Return the settings of a command with what the run in a folder has chosen, if it is there and has.
+
+    Args:
+        output: the folder.
+        config: as the command gives it; the run's own settings have the choice already.
+    """
+    choice = recorded_choice(output)
+    return apply_choice(config, choice) if choice is not None and _asks_for_choice(config) else config
+
+
+def recorded_choice(output: Path) -> MaterialChoice | None:
+    """Return what the run in a folder has chosen; None where there is no run, or it has not chosen."""
+    try:
+        content = json.loads((output / CONFIG).read_text(encoding="utf-8"))
+    except (OSError, ValueError):  # told by whoever needs the file
+        return None
+    choice = content.get(CHOICE_KEY) if isinstance(content, dict) else None
+    return choice if choice in get_args(MaterialChoice) else None
+
+
+def choose_materials(run: ReconstructionRun) -> None:
+    """Choose by short trainings what a long training learns, and tell it; changes the run's settings.
+
+    Nothing is chosen where a recipe was named or is to be used in any case (``materials.fallback``), or where
+    the run begins with a scene; it is told all the same where materials lose accuracy. There are no trials
+    before a short training.
+
+    Raises:
+        CancelledError: stopped as asked.
+    """
+    config = run.train_config
+    steps = iteration_count(config, run.dataset.train_pixel_count, valid_pixel_fraction(run.dataset))
+    if (
+        not config.materials.learn
+        or recorded_choice(run.output) is not None
+        or steps * config.rays_per_batch < LONG_TRAINING_TRIALS * MATERIAL_TRIAL_RAYS
+    ):
+        return
+    run.progress(Noted("Two short trainings show first whether materials explain these photographs."))
+    gain_db = _trial_gain_db(run, config.materials.recipe)
+    is_chosen = _asks_for_choice(run.config) and not has_start(run.output)
+    loss = f"In a short training new views are {-gain_db:.1f} dB worse with materials than without"
+    if not is_chosen or gain_db >= -MAX_FAR_LIGHT_LOSS_DB:
+        if gain_db < -MAX_MATERIAL_LOSS_DB:
+            run.progress(
+                Warned(
+                    f"{loss}: little here reflects its surroundings clearly, or they are near. Leave out "
+                    "--materials unless the scene is to be lit anew."
+                    + _near_field_advice(config.materials.recipe)
+                )
+            )
+        if is_chosen:
+            _record(run, "split_sum")
+        return
+    run.progress(Noted(f"{loss}. Another one shows whether mirrors of what stands near explain them."))
+    near_gain_db = _trial_gain_db(run, "near_field")
+    if near_gain_db >= MIN_NEAR_FIELD_GAIN_DB:
+        run.progress(
+            Warned(
+                f"{loss}, and {near_gain_db:.1f} dB better with materials.recipe=near_field, by which "
+                "mirrors show what stands near: so that is used. --set materials.fallback=false learns "
+                "materials in far light all the same."
+            )
+        )
+        _record(run, "near_field")
+        return
+    run.progress(
+        Warned(
+            f"{loss}: little here reflects its surroundings clearly. The scene is trained without materials; "
+            "--set materials.fallback=false learns them all the same, for a scene that is to be lit anew."
+        )
+    )
+    _record(run, "none")
+
+
+def _asks_for_choice(config: ReconstructionConfig) -> bool:
+    materials = config.train.materials
+    return materials.learn and materials.recipe == "split_sum" and materials.fallback is not False
+
+
+def _near_field_advice(recipe: Recipe) -> str:
+    if recipe == "near_field":
+        return ""
+    return " For something shiny in a room there is --set materials.recipe=near_field."
+
+
+def _trial_gain_db(run: ReconstructionRun, recipe: Recipe) -> float:
+    return material_gain_db(
+        run.dataset,
+        recipe=recipe,
+        background=run.config.train.background,
+        seed=run.config.train.seed,
+        threads=run.threads,
+        should_stop=run.should_stop,
+    )
+
+
+def _record(run: ReconstructionRun, choice: MaterialChoice) -> None:
+    """Keep a choice in the run's settings and in ``config.json``, for this process and later ones."""
+    run.config = apply_choice(run.config, choice)
+    write_config(run.scene, run.output, run.config, {CHOICE_KEY: choice})
