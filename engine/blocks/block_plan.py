@@ -58,6 +58,7 @@ def plan_blocks(
     on_view: Callable[[], None],
     *,
     min_side_px: int = 1,
+    margin: float = MARGIN,
 ) -> tuple[Block, ...]:
     """Cut a scene into blocks that about as many pixels show.
 
@@ -68,6 +69,7 @@ def plan_blocks(
         tracer: for the coarse scene.
         on_view: called after each view, some times for each; it may raise to stop.
         min_side_px: least side of the tiles of pixels.
+        margin: around each core, of the distance over which what is seen of it spreads.
 
     Raises:
         ConfigError: the scene has too few Gaussians that are seen.
@@ -78,8 +80,8 @@ def plan_blocks(
     margins = []
     for box in boxes:
         inside = box.contains(points) & (seen > 0)
-        margins.append(MARGIN * weighted_spread(points[inside], seen[inside]))
-    members = [box.grown(margin).contains(points) for box, margin in zip(boxes, margins, strict=True)]
+        margins.append(margin * weighted_spread(points[inside], seen[inside]))
+    members = [box.grown(width).contains(points) for box, width in zip(boxes, margins, strict=True)]
     pixels = select_pixels(dataset, gaussians, members, tracer, on_view, min_side_px=min_side_px)
     shares = [float(seen[member].sum() / seen.sum()) for member in members]
     return tuple(Block(*parts) for parts in zip(boxes, margins, shares, pixels, strict=True))

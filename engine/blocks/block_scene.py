@@ -17,7 +17,7 @@ from octasplat.engine.blocks.block_merge import (
 from octasplat.engine.blocks.block_plan import Block, plan_blocks
 from octasplat.engine.blocks.piece_progress import PieceProgress
 from octasplat.engine.blocks.piece_settings import (
-    MARGIN,
+    block_margin,
     block_settings,
     coarse_settings,
     coarse_side_px,
@@ -42,7 +42,6 @@ from octasplat.engine.dataset.view_tiles import Rectangles
 from octasplat.engine.train.config import (
     TrainConfig,
     iteration_count,
-    max_gaussian_count,
     min_tile_side_px,
 )
 from octasplat.engine.train.initialization.initial_gaussians import initial_train_state
@@ -104,11 +103,12 @@ def plan_scene(
         return load_plan_to_train(work.folder)
     tell.expect(_guess_iterations(work, count, most_gaussians))
     coarse = _train_coarse(work, tell, open_coarse).gaussians
+    is_finished_together = _is_finished_together(work, most_gaussians)
     blocks = plan_blocks(
         work.dataset, coarse, count, make_piece_tracer(work), lambda: stop_when_asked(work),
         min_side_px=min_tile_side_px(work.config),
+        margin=block_margin(is_finished_later=is_finished_together),
     )  # fmt: skip
-    is_finished_together = _is_finished_together(work, blocks, most_gaussians)
     lengths = []
     for block in blocks:
         config = block_settings(
@@ -176,12 +176,11 @@ def train_block(work: BlockWork, plan: ScenePlan, number: int, tell: PieceProgre
 
 def _guess_iterations(work: BlockWork, count: int, most_gaussians: int | None) -> dict[str, int]:
     """Return the iterations of all pieces of a scene that is not planned yet, of blocks that are alike."""
-    share = min(1.0, (1 + 2 * MARGIN) / count)
+    is_finished_together = _is_finished_together(work, most_gaussians)
+    share = min(1.0, (1 + 2 * block_margin(is_finished_later=is_finished_together)) / count)
     pixels = max(1, round(share * work.dataset.train_pixel_count))
     config = block_settings(work.config, share, most_gaussians, is_finished_later=False)
     lengths = [iteration_count(config, pixels)] * count
-    counts = [max_gaussian_count(config, pixels)] * count
-    is_finished_together = fits_together(work.config, counts, [share] * count, most_gaussians)
     last = (
         {FINISH: finish_iterations(lengths)}
         if is_finished_together
@@ -204,14 +203,11 @@ def _train_coarse(work: BlockWork, tell: PieceProgress, open_coarse: Callable[[i
     return train_piece(work, Piece(COARSE, data, config, start), tell.of_piece(COARSE))
 
 
-def _is_finished_together(work: BlockWork, blocks: Sequence[Block], most_gaussians: int | None) -> bool:
+def _is_finished_together(work: BlockWork, most_gaussians: int | None) -> bool:
     """Return whether one training may hold the Gaussians of all blocks."""
-    counts = []
-    for block in blocks:
-        config = block_settings(work.config, block.share, most_gaussians, is_finished_later=False)
-        valid = valid_pixel_fraction(BlockDataset(work.dataset, block.pixels)) if block.is_trained else 1.0
-        counts.append(max_gaussian_count(config, block.pixels.drawn_pixel_count, valid))
-    return fits_together(work.config, counts, [block.share for block in blocks], most_gaussians)
+    dataset = work.dataset
+    valid = valid_pixel_fraction(dataset)
+    return fits_together(work.config, dataset.train_pixel_count, most_gaussians, valid)
 
 
 def _block_iterations(work: BlockWork, pixels: Rectangles, config: TrainConfig) -> int:

@@ -20,6 +20,9 @@ AUTO_VIEWS = 500
 """Most training views of each block, on average, where the number of blocks is automatic."""
 MARGIN = 0.1
 """Margin around a block's core that is trained with it, of the distance over which what is seen spreads."""
+FINISHED_MARGIN = 0.02
+"""The same where all blocks are finished together, which trains both sides of a cut: what a block learns in
+its margin is dropped, and takes rays that its core would use."""
 COARSE_ITERATIONS, COARSE_GAUSSIANS = 2_500, 50_000
 """Most of the coarse scene, as of the preset fast."""
 COARSE_ITERATION_FRACTION, COARSE_GAUSSIAN_FRACTION = 1 / 2, 1 / 4
@@ -150,18 +153,28 @@ def block_settings(
 
 
 def fits_together(
-    config: TrainConfig, block_gaussians: Sequence[int], shares: Sequence[float], most_gaussians: int | None
+    config: TrainConfig, training_pixels: int, most_gaussians: int | None, valid_fraction: float = 1.0
 ) -> bool:
     """Return whether one training may hold the Gaussians of all blocks, so that they are finished together.
 
     Args:
         config: of the run.
-        block_gaussians: most Gaussians of each block with its margin.
-        shares: of the whole scene that each block with its margin makes.
+        training_pixels: of all training views.
         most_gaussians: of any training; None for the most that the settings allow the whole scene.
+        valid_fraction: share of the pixels that shows anything.
     """
-    expected = config.max_gaussians or round(sum(block_gaussians) / sum(shares))
-    return expected <= (most_gaussians or config.max_gaussians or config.max_gaussians_auto)
+    unlimited = config.model_copy(update={"max_gaussians_auto": max(training_pixels, 1)})
+    wanted = max_gaussian_count(unlimited, training_pixels, valid_fraction)
+    return wanted <= (most_gaussians or config.max_gaussians or config.max_gaussians_auto)
+
+
+def block_margin(*, is_finished_later: bool) -> float:
+    """Return the margin of blocks, of the distance over which what is seen spreads.
+
+    Args:
+        is_finished_later: whether all blocks are finished together, see :func:`fits_together`.
+    """
+    return FINISHED_MARGIN if is_finished_later else MARGIN
 
 
 def finish_settings(config: TrainConfig, iterations: int, of_blocks: Sequence[int] = ()) -> TrainConfig:
@@ -203,13 +216,15 @@ def _first_part(config: TrainConfig) -> TrainConfig:
     """Return the settings of a training that ends where the schedule is at ``FINISH_FROM``."""
     lr, densify = config.lr, config.densify
     mean_final = lr.mean * (lr.mean_final / lr.mean) ** FINISH_FROM
-    stop_fraction = min(1.0, densify.stop_fraction / FINISH_FROM)
+    fewer: dict[str, object] = {"stop_fraction": min(1.0, densify.stop_fraction / FINISH_FROM)}
+    if isinstance(densify, McmcConfig):  # rounds of the whole schedule, so that they are as far apart
+        fewer["relocate_low_weight_rounds"] = max(1, round(FINISH_FROM * densify.relocate_low_weight_rounds))
     return config.model_copy(
         update={
             "shared_sort_until": min(1.0, config.shared_sort_until / FINISH_FROM),
             "weight_averaging_start": min(1.0, config.weight_averaging_start / FINISH_FROM),
             "early_stopping_db": 0.0,
-            "densify": densify.model_copy(update={"stop_fraction": stop_fraction}),
+            "densify": densify.model_copy(update=fewer),
             "lr": lr.model_copy(update={"decay": lr.decay**FINISH_FROM, "mean_final": mean_final}),
         }
     )

@@ -32,7 +32,7 @@ class SparseBlock:
 
 
 def plan_from_points(
-    model: DatasetModel, train_indices: Int64[np.ndarray, " t"], count: int
+    model: DatasetModel, train_indices: Int64[np.ndarray, " t"], count: int, margin: float = MARGIN
 ) -> tuple[SparseBlock, ...]:
     """Cut the sparse points of a scene into blocks that about as many observations fall to.
 
@@ -40,6 +40,7 @@ def plan_from_points(
         model: views, points and observations.
         train_indices: views to train on.
         count: number of blocks.
+        margin: around each core, of the distance over which what is seen of it spreads.
 
     Raises:
         ConfigError: there are too few points that were observed.
@@ -63,7 +64,7 @@ def plan_from_points(
     found = []
     for box in cut_into_boxes(points, weights, count):
         inside = box.contains(points) & (weights > 0)
-        margin_world = MARGIN * weighted_spread(points[inside], weights[inside])
+        margin_world = margin * weighted_spread(points[inside], weights[inside])
         member = box.grown(margin_world).contains(points)
         pixels = [_pixels_of_view(model, index, xy_px[of], member[rows[of]]) for index, of in slices]
         shown, drawn = np.array(pixels).sum(axis=0)

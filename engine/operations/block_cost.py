@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 from octasplat.engine.blocks.piece_settings import (
     FINISH_FRACTION,
-    MARGIN,
     POLISH_FRACTION,
+    block_margin,
     block_settings,
     coarse_settings,
     coarse_side_px,
@@ -117,7 +117,7 @@ def estimate_blocks(
         for cost, seconds, before in zip(costs, block_seconds, alone, strict=True)
     )
     last_seconds = POLISH_FRACTION * max(last_pieces)
-    if fits_together(config.train, counts, [block.share for block in shares], most_gaussians):
+    if fits_together(config.train, training_pixels(config, photographs), most_gaussians):
         last_seconds = FINISH_FRACTION * sum(last_pieces)
         block_bytes.append(whole.memory_bytes)
     # photographs are decoded once more, smaller, for the coarse scene
@@ -184,6 +184,7 @@ def estimate_with_blocks(
         blocks = fewest_blocks(config.train, views, pixels, most)
     if blocks is None or blocks <= 1:  # auto makes none of no photographs
         return estimate_reconstruction(config, photographs, cores)
-    share = min(1.0, (1 + 2 * MARGIN) / blocks)
+    margin = block_margin(is_finished_later=fits_together(config.train, pixels, most))
+    share = min(1.0, (1 + 2 * margin) / blocks)
     each = BlockShare(share, max(1, min(views, math.ceil(2 * share * views))), max(1, round(share * pixels)))
     return estimate_blocks(config, photographs, [each] * blocks, most, cores).total

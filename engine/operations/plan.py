@@ -114,7 +114,7 @@ def run(
         OutputError: the picture cannot be written.
     """
     from octasplat.engine.blocks.block_map import draw_block_map
-    from octasplat.engine.blocks.piece_settings import fewest_blocks
+    from octasplat.engine.blocks.piece_settings import block_margin, fewest_blocks, fits_together
     from octasplat.engine.blocks.sparse_plan import plan_from_points
     from octasplat.engine.dataset import load_dataset_model
     from octasplat.engine.dataset.model_sources import has_model
@@ -139,7 +139,9 @@ def run(
     trained = split_scene(model, rule).train_indices
     pixels = sum(model.views[index].width_px * model.views[index].height_px for index in trained.tolist())
     count = asked.count or fewest_blocks(config.train, len(trained), pixels, asked.most_gaussians)
-    blocks = plan_from_points(model, trained, count)
+    is_finished_later = fits_together(config.train, pixels, asked.most_gaussians)
+    margin = block_margin(is_finished_later=is_finished_later)
+    blocks = plan_from_points(model, trained, count, margin)
     cores = request.cores or threads or available_threads()
     costs = _costs(model, blocks, config, asked.most_gaussians, cores)  # which may refuse the settings
     files: tuple[Path, ...] = ()

@@ -15,9 +15,11 @@ from octasplat.engine.blocks.block_map import SIDE_PX, draw_block_map
 from octasplat.engine.blocks.block_plan import Block
 from octasplat.engine.blocks.partition import Box
 from octasplat.engine.blocks.piece_settings import (
+    block_margin,
     block_settings,
     fewest_blocks,
     finish_settings,
+    fits_together,
     polish_settings,
 )
 from octasplat.engine.blocks.scene_plan import ScenePlan, save_plan
@@ -35,7 +37,7 @@ from octasplat.engine.pipeline import BlockRequest
 from octasplat.engine.pipeline.block_steps import count_blocks
 from octasplat.engine.pipeline.run import ReconstructionRun
 from octasplat.engine.runs.config import resolve_config
-from octasplat.engine.train.config import TrainConfig
+from octasplat.engine.train.config import McmcConfig, TrainConfig
 from tests.support.tiny_dataset import make_tiny_dataset
 
 
@@ -152,6 +154,44 @@ def test_finish_takes_the_last_steps_of_the_blocks_first(length: int) -> None:
     assert (polish.mean, polish.decay) == (whole.mean_final, 1)
     for name in ("quat", "log_scale", "opacity", "color"):
         assert getattr(polish, name) == pytest.approx(whole.decay * getattr(whole, name)), name
+
+
+def test_blocks_finished_later_move_gaussians_as_far_apart_as_the_whole_schedule() -> None:
+    """Of rounds over all of the schedule, blocks have those of their part."""
+    rounds = {}
+    for given in (1, 16, 40):
+        config = TrainConfig(densify=McmcConfig(relocate_low_weight_rounds=given))
+        for is_finished_later in (False, True):
+            densify = block_settings(config, 0.5, None, is_finished_later=is_finished_later).densify
+            assert isinstance(densify, McmcConfig)
+            rounds[given, is_finished_later] = densify.relocate_low_weight_rounds
+    assert [rounds[given, False] for given in (1, 16, 40)] == [1, 16, 40]
+    assert [rounds[given, True] for given in (1, 16, 40)] == [1, 11, 28]
+
+
+@pytest.mark.parametrize(
+    ("settings", "pixels", "most", "expected"),
+    [
+        ({"max_gaussians": 1000}, 10**9, None, True),
+        ({"max_gaussians": 1000}, 10**9, 999, False),
+        ({}, 30 * 400_000, None, True),
+        ({}, 31 * 400_000, None, False),  # more than the settings allow any scene
+        ({}, 30 * 50_000, 49_999, False),
+    ],
+)
+def test_blocks_are_finished_together_where_one_training_holds_what_pixels_ask_for(
+    settings: dict[str, Any], pixels: int, most: int | None, expected: bool
+) -> None:
+    assert fits_together(TrainConfig(**settings), pixels, most) is expected
+
+
+def test_blocks_share_less_with_narrower_margins_and_nothing_without(scene: Path) -> None:
+    model = load_dataset_model(scene)
+    shared = []
+    for margin in (0.0, block_margin(is_finished_later=True), block_margin(is_finished_later=False)):
+        blocks = plan_from_points(model, np.arange(12), 4, margin)
+        shared.append(sum(block.share for block in blocks) - 1)
+    assert shared[0] == pytest.approx(0) and shared[0] < shared[1] < shared[2]
 
 
 def test_finish_averages_states_unless_the_settings_forbid_it() -> None:

@@ -9,7 +9,9 @@ import pytest
 from PIL import Image
 
 from octasplat.engine.blocks.block_plan import plan_blocks
+from octasplat.engine.blocks.piece_settings import FINISHED_MARGIN, MARGIN
 from octasplat.engine.blocks.piece_training import RESULT
+from octasplat.engine.blocks.scene_plan import load_plan
 from octasplat.engine.core.errors import CancelledError, ConfigError
 from octasplat.engine.core.events import CheckpointWritten, Event, HeldOutMeasured, Noted, TrainingProgress
 from octasplat.engine.dataset import Dataset
@@ -146,6 +148,18 @@ def test_merged_scene_numbers_one_core_after_the_other(scene: Path, polished_blo
         stays = [np.isin(core.sh[rows, 0, 0], part.sh[:, 0, 0]).sum() for rows in (is_inner, ~is_inner)]
         assert is_inner.sum() - stays[0] <= 2 * (len(core) - count)
         assert stays[1] < 0.1 * (~is_inner).sum()  # the polish has moved these
+
+
+@pytest.mark.exhaustive
+def test_margin_is_narrow_where_blocks_are_finished_together(
+    two_blocks: tuple, polished_blocks: Path
+) -> None:
+    together, polished = (load_plan(run / "blocks") for run in (two_blocks[0], polished_blocks))
+    assert together.is_finished_together and not polished.is_finished_together
+    for narrow, wide in zip(together.blocks, polished.blocks, strict=True):
+        np.testing.assert_allclose(
+            narrow.margin_world / FINISHED_MARGIN, wide.margin_world / MARGIN, rtol=1e-12
+        )
 
 
 @pytest.mark.exhaustive
