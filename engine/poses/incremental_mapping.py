@@ -54,7 +54,7 @@ def map_photographs(
     Args:
         database: with matches.
         seed: of everything random.
-        on_count: hears of photographs of the largest model so far.
+        on_count: hears of the photographs in all models so far.
         allow_weak_links: place photographs by fewer matches, too.
         start: folder of a model to go on from.
 
@@ -87,7 +87,7 @@ def map_in_segments(
         database: with matches.
         stored: state of this mapping, from which it goes on.
         seed: of everything random.
-        on_count: hears of photographs of the largest model so far.
+        on_count: hears of the photographs in all models so far.
         allow_weak_links: place photographs by fewer matches, too.
         start: folder of a model to go on from.
 
@@ -113,8 +113,11 @@ def _map_segment(
     manager = pycolmap.ReconstructionManager()
     if (begun := stored.state.current or start) is not None:
         manager.read(begun)
-    options.image_names = _names_left(database, stored.models(), _all_models(manager))
-    is_segment_end = _run_mapper(options, database, manager, count, ends_segments=True)
+    finished = stored.models()
+    options.image_names = _names_left(database, finished, _all_models(manager))
+    is_segment_end = _run_mapper(
+        options, database, manager, count, ends_segments=True, finished_count=_placed_count(finished)
+    )
     models = _all_models(manager)
     if is_segment_end:
         stored.write(models[:-1], models[-1], is_done=False)
@@ -141,7 +144,13 @@ def _options(seed: int, allow_weak_links: bool) -> Any:
 
 
 def _run_mapper(
-    options: Any, database: Path, manager: Any, count: "_Count", *, ends_segments: bool = False
+    options: Any,
+    database: Path,
+    manager: Any,
+    count: "_Count",
+    *,
+    ends_segments: bool = False,
+    finished_count: int = 0,
 ) -> bool:
     """Run COLMAP's mapper, with a model in ``manager`` to go on from or without; return where it ends.
 
@@ -152,6 +161,7 @@ def _run_mapper(
         count: counts the photographs.
         ends_segments: stop after an adjustment of all photographs of a model that has grown by
             :data:`_SEGMENT_GROWTH`.
+        finished_count: photographs of models that are complete.
 
     Returns:
         Whether that was the end of a segment; the last model is not complete then.
@@ -162,14 +172,14 @@ def _run_mapper(
     begun = manager.get(0).num_reg_frames() if manager.size() else 0
     adjusted = (begun, manager.get(0).num_points3D()) if begun else (0, 0)
     segment_end: float = max(_SEGMENT_GROWTH * begun, _MIN_SEGMENT)
-    count.begin(begun)
+    count.begin(finished_count + begun)
 
     def first_pair() -> None:
         nonlocal adjusted, segment_end
         model = manager.get(manager.size() - 1)
         adjusted = model.num_reg_frames(), model.num_points3D()
-        segment_end = _MIN_SEGMENT  # a new model: its photographs are counted anew
-        count.begin(adjusted[0])
+        segment_end = _MIN_SEGMENT  # of a new model
+        count.begin(finished_count + _placed_count(_all_models(manager)))
 
     def another() -> None:
         nonlocal adjusted
@@ -213,14 +223,14 @@ def _adjust_complete(model: Any, matches: Any, options: Any) -> None:
 
 
 class _Count:
-    """Counts the photographs of a model that grows; tells of those of the largest so far."""
+    """Counts the photographs of all models; tells of the most so far, as small models are given up."""
 
     def __init__(self, on_count: OnCount) -> None:
         self._on_count = on_count
         self._placed = self._most = 0
 
     def begin(self, placed: int) -> None:
-        """Count from here on; a smaller model is no progress."""
+        """Count from here on."""
         self._placed = placed
         self._most = max(self._most, placed)
 
@@ -234,6 +244,10 @@ class _Count:
 
 def _all_models(manager: Any) -> list[Any]:
     return [manager.get(k) for k in range(manager.size())]
+
+
+def _placed_count(models: Sequence[Any]) -> int:
+    return sum(model.num_reg_images() for model in models)
 
 
 def _names_left(database: Path, finished: Sequence[Any], current: Sequence[Any]) -> list[str]:

@@ -51,6 +51,10 @@ def short_segments(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(incremental_mapping, "_MIN_SEGMENT", 8)
 
 
+COUNTED = [*range(3, PHOTOGRAPHS + 1), *range(PHOTOGRAPHS + 3, PHOTOGRAPHS + PHOTOGRAPHS // 2 + 1)]
+"""Of both models, each of which begins with two photographs."""
+
+
 def ignore_count(_count: int) -> None:
     """Count nothing."""
 
@@ -75,7 +79,7 @@ def test_one_run_gives_what_colmap_gives(two_places: Path, tmp_path: Path) -> No
     counted: list[int] = []
     models = map_photographs(two_places, seed=0, on_count=counted.append)
     assert [model.num_reg_images() for model in models] == [PHOTOGRAPHS, PHOTOGRAPHS // 2]
-    assert counted == list(range(3, PHOTOGRAPHS + 1))
+    assert counted == COUNTED
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = 1, 0
     options.mapper.random_seed = options.triangulation.random_seed = 0
@@ -94,7 +98,7 @@ def test_segments_give_the_models_of_one_run(two_places: Path, tmp_path: Path) -
     models = map_in_segments(
         two_places, StoredMapping(tmp_path, MATCHES, states.append), seed=0, on_count=counted.append
     )
-    assert counted == list(range(3, PHOTOGRAPHS + 1))
+    assert counted == COUNTED
     assert len(states) >= 4
     whole = map_photographs(two_places, seed=0, on_count=ignore_count)
     assert [sorted(model.reg_image_ids()) for model in models] == [
