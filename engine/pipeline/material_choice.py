@@ -1,4 +1,4 @@
-"""Whether a run learns materials, and by which recipe: judged by short trainings before a long one."""
+"""The recipe by which a run learns materials: chosen by short trainings before a long one."""
 
 import json
 from pathlib import Path
@@ -15,35 +15,25 @@ from octasplat.engine.train.config import iteration_count
 from octasplat.engine.train.loop.trial_training import MATERIAL_TRIAL_RAYS, material_gain_db
 from octasplat.engine.train.sampling.pixel_sampler import valid_pixel_fraction
 
-MaterialChoice = Literal["split_sum", "near_field", "none"]
-"""What a run learns: materials in far light, mirrors of what stands near, or no materials."""
+MaterialChoice = Literal["split_sum", "near_field"]
+"""Recipes that are chosen between: materials in far light, or mirrors of what stands near."""
 CHOICE_KEY = "material_choice"
 """Of ``config.json``, where a run has chosen."""
 LONG_TRAINING_TRIALS = 8
 """Trainings of less than so many times the rays of a trial are begun without one."""
 MAX_MATERIAL_LOSS_DB = 1.0
-"""Loss of a trial above which materials are warned of."""
-MAX_FAR_LIGHT_LOSS_DB = 2.5
-"""Loss of a trial in far light above which other ways are tried."""
-MIN_NEAR_FIELD_GAIN_DB = 0.5
-"""Gain of a trial from which on what reflects mirrors what stands near."""
+"""Loss of a trial above which ``near_field`` is tried, and chosen if it loses nothing."""
 
 
 def apply_choice(config: ReconstructionConfig, choice: MaterialChoice) -> ReconstructionConfig:
-    """Return the settings of a run that asked for materials, with what was chosen.
+    """Return the settings of a run that asked for materials, with the recipe that was chosen.
 
     Example:
         >>> from octasplat.engine.runs.config import resolve_config
-        >>> apply_choice(resolve_config("fast", materials=True), "none") == resolve_config("fast")
-        True
+        >>> apply_choice(resolve_config("fast", materials=True), "near_field").train.materials.recipe
+        'near_field'
     """
-    if choice == "split_sum":
-        return config
-    before = config.model_dump(mode="json")
-    if choice == "near_field":
-        return revise_config(before, train={"materials": {"recipe": choice}})
-    # a term of materials alone, which would be refused
-    return revise_config(before, materials=False, train={"loss": {"edges": None}})
+    return revise_config(config.model_dump(mode="json"), train={"materials": {"recipe": choice}})
 
 
 def with_recorded_choice(output: Path, config: ReconstructionConfig) -> ReconstructionConfig:
@@ -88,49 +78,41 @@ def choose_materials(run: ReconstructionRun) -> None:
     run.progress(Noted("Two short trainings show first whether materials explain these photographs."))
     gain_db = _trial_gain_db(run, config.materials.recipe)
     is_chosen = _asks_for_choice(run.config) and not has_start(run.output)
-    loss = f"In a short training new views are {-gain_db:.1f} dB worse with materials than without"
-    if not is_chosen or gain_db >= -MAX_FAR_LIGHT_LOSS_DB:
-        if gain_db < -MAX_MATERIAL_LOSS_DB:
-            run.progress(
-                Warned(
-                    f"{loss}: little here reflects its surroundings clearly, or they are near. Leave out "
-                    "--materials unless the scene is to be lit anew."
-                    + _near_field_advice(config.materials.recipe)
-                )
-            )
+    if gain_db >= -MAX_MATERIAL_LOSS_DB:
         if is_chosen:
             _record(run, "split_sum")
         return
-    run.progress(Noted(f"{loss}. Another one shows whether mirrors of what stands near explain them."))
-    near_gain_db = _trial_gain_db(run, "near_field")
-    if near_gain_db >= MIN_NEAR_FIELD_GAIN_DB:
-        run.progress(
-            Warned(
-                f"{loss}, and {near_gain_db:.1f} dB better with materials.recipe=near_field, by which "
-                "mirrors show what stands near: so that is used. --set materials.fallback=false learns "
-                "materials in far light all the same."
+    loss = f"In a short training new views are {-gain_db:.1f} dB worse with materials than without"
+    if is_chosen:
+        run.progress(Noted(f"{loss}. Another one shows whether mirrors of what stands near explain them."))
+        near_gain_db = _trial_gain_db(run, "near_field")
+        if near_gain_db >= 0:
+            run.progress(
+                Warned(
+                    f"{loss}, but {near_gain_db:.1f} dB better with materials.recipe=near_field, by which "
+                    "mirrors show what stands near. That recipe is used; --set materials.fallback=false "
+                    "keeps the other."
+                )
             )
-        )
-        _record(run, "near_field")
-        return
+            _record(run, "near_field")
+            return
+        _record(run, "split_sum")
+    advice = (
+        ""
+        if is_chosen or config.materials.recipe == "near_field"
+        else " For something shiny in a room there is --set materials.recipe=near_field."
+    )
     run.progress(
         Warned(
-            f"{loss}: little here reflects its surroundings clearly. The scene is trained without materials; "
-            "--set materials.fallback=false learns them all the same, for a scene that is to be lit anew."
+            f"{loss}: little here reflects its surroundings clearly, or they are near. Leave out --materials "
+            f"unless the scene is to be lit anew.{advice}"
         )
     )
-    _record(run, "none")
 
 
 def _asks_for_choice(config: ReconstructionConfig) -> bool:
     materials = config.train.materials
     return materials.learn and materials.recipe == "split_sum" and materials.fallback is not False
-
-
-def _near_field_advice(recipe: Recipe) -> str:
-    if recipe == "near_field":
-        return ""
-    return " For something shiny in a room there is --set materials.recipe=near_field."
 
 
 def _trial_gain_db(run: ReconstructionRun, recipe: Recipe) -> float:

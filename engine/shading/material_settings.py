@@ -45,9 +45,9 @@ class MaterialSettings(Settings):
     )
     fallback: Annotated[bool | None, ADVANCED] = Field(
         None,
-        description="Before a long training by the recipe split_sum, short ones show whether materials "
-        "explain the photographs. Where they lose much to plain colors, the recipe near_field is used if it "
-        "gains, and no materials are learnt otherwise; false learns them all the same.",
+        description="Before a long training by the recipe split_sum, short ones show whether it explains the "
+        "photographs. Where new views are more than 1 dB worse than without materials, and not worse by the "
+        "recipe near_field, that is used; false keeps split_sum.",
     )
     up_world: Annotated[tuple[float, float, float], Unit("world direction"), ADVANCED] = Field(
         (0.0, 0.0, 1.0),
