@@ -54,7 +54,7 @@ def map_photographs(
     Args:
         database: with matches.
         seed: of everything random.
-        on_count: hears of the photographs in all models so far.
+        on_count: hears of photographs of the largest model so far.
         allow_weak_links: place photographs by fewer matches, too.
         start: folder of a model to go on from.
 
@@ -179,7 +179,8 @@ def _run_mapper(
         model = manager.get(manager.size() - 1)
         adjusted = model.num_reg_frames(), model.num_points3D()
         segment_end = _MIN_SEGMENT  # of a new model
-        count.begin(finished_count + _placed_count(_all_models(manager)))
+        models = _all_models(manager) if ends_segments else [model]
+        count.begin(finished_count + _placed_count(models))
 
     def another() -> None:
         nonlocal adjusted
@@ -223,7 +224,7 @@ def _adjust_complete(model: Any, matches: Any, options: Any) -> None:
 
 
 class _Count:
-    """Counts the photographs of all models; tells of the most so far, as small models are given up."""
+    """Counts photographs of the models that grow; tells of the most so far, as small models are given up."""
 
     def __init__(self, on_count: OnCount) -> None:
         self._on_count = on_count
