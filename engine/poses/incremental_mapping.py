@@ -197,14 +197,16 @@ def _run_mapper(
     callbacks = pycolmap.IncrementalPipelineCallback
     pipeline.add_callback(callbacks.INITIAL_IMAGE_PAIR_REG_CALLBACK.value, first_pair)
     pipeline.add_callback(callbacks.NEXT_IMAGE_REG_CALLBACK.value, another)
+    is_segment_end = False
     try:
         pipeline.run()
     except _SegmentEndError:
-        return True
+        is_segment_end = True
     if ends_segments:
-        for model in _all_models(manager):
-            _adjust_complete(model, pipeline.database_cache, options)
-    return False
+        models = _all_models(manager)
+        for complete in models[:-1] if is_segment_end else models:
+            _adjust_complete(complete, pipeline.database_cache, options)
+    return is_segment_end
 
 
 def _adjust_complete(model: Any, matches: Any, options: Any) -> None:
