@@ -68,12 +68,10 @@ def choose_materials(run: ReconstructionRun) -> None:
         CancelledError: stopped as asked.
     """
     config = run.train_config
+    if not config.materials.learn or recorded_choice(run.output) is not None:
+        return
     steps = iteration_count(config, run.dataset.train_pixel_count, valid_pixel_fraction(run.dataset))
-    if (
-        not config.materials.learn
-        or recorded_choice(run.output) is not None
-        or steps * config.rays_per_batch < LONG_TRAINING_TRIALS * MATERIAL_TRIAL_RAYS
-    ):
+    if steps * config.rays_per_batch < LONG_TRAINING_TRIALS * MATERIAL_TRIAL_RAYS:
         return
     run.progress(Noted("Two short trainings show first whether materials explain these photographs."))
     gain_db = _trial_gain_db(run, config.materials.recipe)

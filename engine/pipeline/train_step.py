@@ -64,7 +64,7 @@ class TrainStep:
     def __call__(self, run: ReconstructionRun) -> None:
         """Train, and write the scene after everything else."""
         began = time.perf_counter()
-        if not any((run.output / CHECKPOINTS).glob("*.npz")):
+        if count_blocks(run) == 1 and not any((run.output / CHECKPOINTS).glob("*.npz")):
             choose_materials(run)  # before the plan, which shares out what is left of the time
         dataset, config = run.dataset, run.config
         steps, choosing_s = 0, time.perf_counter() - began
