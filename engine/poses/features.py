@@ -227,13 +227,6 @@ def preselect_pairs(
     small = database.with_name("quick.db")
     small.unlink(missing_ok=True)
     copy_largest_features(database, small, len(names), PRESELECTION_FEATURES)
-    options = pycolmap.FeatureMatchingOptions()
-    options.num_threads = threads
-    options.use_gpu = False
-    options.skip_geometric_verification = True
-    # the quick look needs no geometry, only counts
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.min_num_inliers = _MIN_PRESELECTION_INLIERS
     count = len(names)
     if config.is_large(count):
         proposed, partners = (
@@ -242,21 +235,13 @@ def preselect_pairs(
         )
     else:
         proposed, partners = all_pairs(count), config.partners
-    alike: dict[Pair, int] = {}
-    looked = unlike = pair_count(count) - len(proposed)
-    on_look(unlike, 0.0)
-    for some in batch_pairs(proposed, _PRESELECTION_PAIRS_PER_BATCH):
-        _match_pairs(small, names, some, options, verification)
-        with pycolmap.Database.open(small) as found:
-            ids, counts = found.read_num_matches()
-            found.clear_matches()
-        for pair_id, matches in zip(ids, counts, strict=True):
-            first, second = pycolmap.pair_id_to_image_pair(pair_id)
-            alike[first - 1, second - 1] = matches
-        looked += len(some)
-        share = 1 - (pair_count(count) - looked) / len(proposed)
-        unlike = looked - sum(matches >= PRESELECTION_MATCHES for matches in alike.values())
-        on_look(unlike, share)
+    unlikely = pair_count(count) - len(proposed)
+    on_look(unlikely, 0.0)
+
+    def tell(looked: int, found: int) -> None:
+        on_look(unlikely + looked - found, looked / len(proposed))
+
+    alike = look_at_pairs(small, names, proposed, threads=threads, on_looked=tell)
     small.unlink()
     return select_pairs(
         alike,
@@ -265,6 +250,49 @@ def preselect_pairs(
         partners=partners,
         neighbours=config.neighbours,
     )
+
+
+def look_at_pairs(
+    small: Path,
+    names: Sequence[str],
+    pairs: Sequence[Pair],
+    *,
+    threads: int,
+    on_looked: Callable[[int, int], None] = lambda _looked, _alike: None,
+) -> dict[Pair, int]:
+    """Return the matches of pairs of photographs of which only the largest features are known.
+
+    Args:
+        small: database of these features; has no matches before and after.
+        names: of the photographs, as they are numbered.
+        pairs: indices into ``names``.
+        threads: to use; -1 means all cores.
+        on_looked: hears of pairs that were looked at, and how many of them are alike.
+
+    Returns:
+        The number of matches of pairs that have any.
+    """
+    options = pycolmap.FeatureMatchingOptions()
+    options.num_threads = threads
+    options.use_gpu = False
+    options.skip_geometric_verification = True
+    # the quick look needs no geometry, only counts
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.min_num_inliers = _MIN_PRESELECTION_INLIERS
+    matches_of: dict[Pair, int] = {}
+    looked = alike = 0
+    for some in batch_pairs(pairs, _PRESELECTION_PAIRS_PER_BATCH):
+        _match_pairs(small, names, some, options, verification)
+        with pycolmap.Database.open(small) as found:
+            ids, counts = found.read_num_matches()
+            found.clear_matches()
+        for pair_id, matches in zip(ids, counts, strict=True):
+            first, second = pycolmap.pair_id_to_image_pair(pair_id)
+            matches_of[first - 1, second - 1] = matches
+            alike += matches >= PRESELECTION_MATCHES
+        looked += len(some)
+        on_looked(looked, alike)
+    return matches_of
 
 
 def _match_pairs(

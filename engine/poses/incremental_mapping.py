@@ -29,8 +29,10 @@ _MIN_SEGMENT = 250
 """Photographs of the first segment at least ..."""
 _SEGMENT_GROWTH = 1.2
 """... and by which a model grows in any further one."""
+USUAL_INLIERS = 30
+"""Matches by which a photograph can be placed ..."""
 _WEAK_INLIERS = 15
-"""Matches by which a photograph can be placed where the usual 30 leave some out."""
+"""... and those where these leave some out."""
 _WEAK_INITIAL_INLIERS = 50
 """The same for the first two."""
 
@@ -76,6 +78,8 @@ def map_in_segments(
     on_count: OnCount,
     allow_weak_links: bool = False,
     start: Path | None = None,
+    apart: Sequence[Any] = (),
+    extends_only: bool = False,
 ) -> list[Any]:
     """Reconstruct a large capture as :func:`map_photographs` does, with less effort for each photograph.
 
@@ -90,11 +94,14 @@ def map_in_segments(
         on_count: hears of the photographs in all models so far.
         allow_weak_links: place photographs by fewer matches, too.
         start: folder of a model to go on from.
+        apart: complete models, whose photographs are not mapped again.
+        extends_only: map no models beside ``start``.
 
     Returns:
-        Each a ``pycolmap.Reconstruction``; none where nothing fits together.
+        Each a ``pycolmap.Reconstruction``, without those apart; none where nothing fits together.
     """
     options = _options(seed, allow_weak_links)
+    options.multiple_models = not extends_only
     options.ba_global_frames_ratio = options.ba_global_points_ratio = _LARGE_GROWTH
     options.ba_global_max_refinements = _LARGE_REFINEMENTS
     options.ba_global_max_num_iterations = _LARGE_ADJUSTMENT_STEPS
@@ -102,18 +109,23 @@ def map_in_segments(
     options.ba_local_function_tolerance = _COMPLETE_TOLERANCE
     count = _Count(on_count)
     while not stored.state.is_done:
-        _map_segment(options, database, stored, start, count)
+        _map_segment(options, database, stored, start, apart, count)
     return sorted(stored.models(), key=model_rank, reverse=True)
 
 
 def _map_segment(
-    options: Any, database: Path, stored: StoredMapping, start: Path | None, count: "_Count"
+    options: Any,
+    database: Path,
+    stored: StoredMapping,
+    start: Path | None,
+    apart: Sequence[Any],
+    count: "_Count",
 ) -> None:
     """Map until a segment ends or there is no more to map, and write the state."""
     manager = pycolmap.ReconstructionManager()
     if (begun := stored.state.current or start) is not None:
         manager.read(begun)
-    finished = stored.models()
+    finished = [*apart, *stored.models()]
     options.image_names = _names_left(database, finished, _all_models(manager))
     is_segment_end = _run_mapper(
         options, database, manager, count, ends_segments=True, finished_count=_placed_count(finished)
@@ -136,6 +148,7 @@ def _options(seed: int, allow_weak_links: bool) -> Any:
     # It tries photographs whose points are not known yet by RANSAC of a solver that takes milliseconds, up to
     # minutes for each photograph that matches falsely, as all do of another place.
     options.structure_less_registration_fallback = False
+    options.mapper.abs_pose_min_num_inliers = USUAL_INLIERS
     options.extract_colors = False  # extracted once, for the model that is kept
     if allow_weak_links:
         options.mapper.abs_pose_min_num_inliers = _WEAK_INLIERS

@@ -1,8 +1,9 @@
-"""Pairs that may link photographs of a large capture that were left out to those that have poses.
+"""Pairs that may link photographs of a large capture that were left out to those of its largest model.
 
 A part of a capture that stays apart is most alike to itself, so that proposals for the quick look seldom lead
 out of it. Here only photographs that have poses are proposed: the nearest by GPS where a photograph has it,
-else those that look most alike by the vocabulary of the capture.
+else those that look most alike by the vocabulary of the capture. Photographs of other models are as many as
+half of the capture, so that a quick look decides which of their pairs are matched.
 """
 
 from collections.abc import Collection, Sequence
@@ -12,10 +13,11 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from octasplat.engine.poses.config import PRESELECTION_FEATURES
-from octasplat.engine.poses.features import copy_largest_features
+from octasplat.engine.poses.config import PRESELECTION_FEATURES, PRESELECTION_MATCHES, PosesConfig
+from octasplat.engine.poses.features import copy_largest_features, look_at_pairs, match_pairs
+from octasplat.engine.poses.incremental_mapping import USUAL_INLIERS
 from octasplat.engine.poses.pair_proposals import alike_by_vocabulary, gps_positions_m
-from octasplat.engine.poses.pairs import Pair
+from octasplat.engine.poses.pairs import Pair, pairs_with
 
 LINKS_PER_PHOTOGRAPH = 30
 """Photographs with poses that one without is matched with."""
@@ -66,3 +68,70 @@ def _first_pairs(k: int, others: Sequence[int], tried: Collection[Pair]) -> set[
     """Return pairs of a photograph with the first of others that it was not matched with."""
     pairs = ((min(k, other), max(k, other)) for other in others)
     return set(islice((pair for pair in pairs if pair not in tried), LINKS_PER_PHOTOGRAPH))
+
+
+def match_remaining(
+    database: Path,
+    names: Sequence[str],
+    rest: Sequence[int],
+    posed: Collection[int],
+    matched: Collection[Pair],
+    config: PosesConfig,
+    *,
+    threads: int,
+) -> None:
+    """Match photographs of no model with all others, and take matches that are less clear.
+
+    In a large capture the others are those near by name, and those of the largest model that are near
+    by GPS or look most alike.
+
+    Args:
+        database: with features; gets the matches.
+        names: of all photographs, as they are numbered.
+        rest: indices of those of no model.
+        posed: of those of the largest model.
+        matched: pairs that were matched already.
+        config: settings.
+        threads: to use; -1 means all cores.
+    """
+    if config.is_large(len(names)):
+        near = pairs_with(rest, len(names), matched, within=NEIGHBORS_BY_NAME)
+        pairs = sorted({*near, *propose_links(database, rest, posed, matched, seed=config.seed)})
+    else:
+        pairs = pairs_with(rest, len(names), matched)
+    match_pairs(database, names, pairs, config, thorough=True, threads=threads, on_count=lambda _done: None)
+
+
+def match_links(
+    database: Path,
+    names: Sequence[str],
+    pairs: Sequence[Pair],
+    config: PosesConfig,
+    *,
+    threads: int,
+    min_inliers: int = USUAL_INLIERS,
+) -> bool:
+    """Match those pairs of photographs of two models that a quick look finds alike.
+
+    Args:
+        database: with features; gets the matches.
+        names: of the photographs, as they are numbered.
+        pairs: indices into ``names``.
+        config: settings.
+        threads: to use; -1 means all cores.
+        min_inliers: matches of one geometry by which a photograph can be placed.
+
+    Returns:
+        Whether any of the pairs has so many.
+    """
+    small = database.with_name("links.db")
+    small.unlink(missing_ok=True)
+    copy_largest_features(database, small, len(names), PRESELECTION_FEATURES)
+    looked = look_at_pairs(small, names, pairs, threads=threads)
+    small.unlink()
+    alike = sorted(pair for pair, matches in looked.items() if matches >= PRESELECTION_MATCHES)
+    match_pairs(database, names, alike, config, thorough=False, threads=threads, on_count=lambda _done: None)
+    with pycolmap.Database.open(database) as matched:
+        return any(
+            len(matched.read_two_view_geometry(a + 1, b + 1).inlier_matches) >= min_inliers for a, b in alike
+        )

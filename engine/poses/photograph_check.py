@@ -7,9 +7,12 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from octasplat.engine.core.errors import DatasetError
+from octasplat.engine.core.events import EventListener, Warned
 from octasplat.engine.dataset.image_info import ImageInfo
 from octasplat.engine.dataset.images import read_image_info, read_photo
 
+MIN_RECOMMENDED_SIDE_PX = 480
+"""Below this, what COLMAP finds was seen to be wrong without any sign of it."""
 DECODING_BYTES = 2 << 30
 """Memory that decoding threads may take together; one thread always runs."""
 
@@ -66,3 +69,15 @@ def read_image_infos(images: Path, names: Sequence[str]) -> dict[str, ImageInfo]
         with contextlib.suppress(DatasetError):
             found[name] = read_image_info(images / name)
     return found
+
+
+def warn_of_small_photographs(infos: Sequence[ImageInfo], progress: EventListener) -> None:
+    """Warn where all photographs are so small that poses found from them may be wrong."""
+    longest = max(max(info.width_px, info.height_px) for info in infos)
+    if longest < MIN_RECOMMENDED_SIDE_PX:
+        progress(
+            Warned(
+                f"The photographs are {longest} px long at most; poses found from such small ones may be "
+                "wrong, so give them at full size."
+            )
+        )

@@ -38,11 +38,20 @@ from octasplat.engine.poses.features import (
 )
 from octasplat.engine.poses.found_models import write_other_models
 from octasplat.engine.poses.gps_contradictions import GroundPositions, read_ground_positions
-from octasplat.engine.poses.incremental_mapping import best_rank, map_in_segments, map_photographs
-from octasplat.engine.poses.linking_pairs import NEIGHBORS_BY_NAME, propose_links
+from octasplat.engine.poses.incremental_mapping import (
+    best_rank,
+    map_in_segments,
+    map_photographs,
+    model_rank,
+)
+from octasplat.engine.poses.linking_pairs import match_links, match_remaining, propose_links
 from octasplat.engine.poses.model_selection import distinct_models, model_facts
-from octasplat.engine.poses.pairs import Pair, all_pairs, pair_count, pairs_with
-from octasplat.engine.poses.photograph_check import check_photographs_decode, read_image_infos
+from octasplat.engine.poses.pairs import Pair, all_pairs, pair_count
+from octasplat.engine.poses.photograph_check import (
+    check_photographs_decode,
+    read_image_infos,
+    warn_of_small_photographs,
+)
 from octasplat.engine.poses.search_check import check_mapped, search_rank
 from octasplat.engine.poses.stored_mappings import (
     MAPPINGS_FOLDER,
@@ -62,8 +71,6 @@ from octasplat.engine.poses.stored_search import (
 from octasplat.engine.poses.whole_files import copy_database, write_model
 from octasplat.engine.poses.workspace import link_photographs, progress_stage
 
-MIN_RECOMMENDED_SIDE_PX = 480
-"""Below this, what COLMAP finds was seen to be wrong without any sign of it."""
 _FEW_FEATURES = 50
 
 
@@ -104,7 +111,7 @@ class PoseSearch:
         pycolmap.logging.minloglevel = 2  # its warnings are of use to nobody here
         self._drop_unreadable()
         self._one_camera = self._has_one_size()
-        self._warn_of_small_photographs()
+        warn_of_small_photographs([self._infos[name] for name in self._names], progress)
 
     def run(self, found: Path) -> None:
         """Search, a second time if photographs are left out, and write the best model.
@@ -121,8 +128,8 @@ class PoseSearch:
         if placed < count and (count <= config.exhaustive_up_to or placed < RETRY_BELOW_SHARE * count):
             self._progress(
                 Warned(
-                    f"{placed} of {count} photographs could be placed at first; they are searched again with "
-                    "more features."
+                    f"{placed} of {count} photographs could be placed at first; they are searched again "
+                    "with more features."
                 )
             )
             # max keeps the first of equals: the usual search
@@ -248,41 +255,43 @@ class PoseSearch:
         ground_m: GroundPositions,
         at: Callable[[int], None],
     ) -> MappedModels:
-        """Register photographs that the largest model leaves out, with fewer matches required.
+        """Register photographs that the largest model leaves out.
 
-        They are matched with all others; in a large capture with those that are near by name, and with those
-        of the largest model that are near by GPS or look most alike.
+        For those of no model fewer matches are required. Other models of a large capture join the largest one
+        only by as many matches as any photograph.
         """
-        models = mapped.models
-        posed = {number - 1 for number in models[0].reg_image_ids()} if models else set[int]()
-        count = len(self._names)
-        rest = [k for k in range(count) if k not in posed]
-        if self._config.is_large(count):
-            near = pairs_with(rest, count, matched, within=NEIGHBORS_BY_NAME)
-            links = propose_links(database, rest, posed, matched, seed=self._config.seed)
-            more = sorted({*near, *links})
-        else:
-            more = pairs_with(rest, count, matched)
-        if more:
-            match_pairs(
-                database,
-                self._aliases,
-                more,
-                self._config,
-                thorough=True,
-                threads=self._threads,
-                on_count=lambda _done: None,
-            )
-        start = None
-        if models:
-            start = self._work / "start"
-            write_model(models[0], start)
-        return register_without_pairs_against_gps(
-            mapped,
-            database,
-            ground_m,
-            lambda copy: self._map(copy, at, allow_weak_links=True, start=start),
-        )
+        config, count = self._config, len(self._names)
+        apart = mapped.models[1:] if config.is_large(count) else []
+        posed = _numbers(mapped.models[:1])
+        if of_others := sorted(_numbers(apart) - posed):
+            links = propose_links(database, of_others, posed, matched, seed=config.seed)
+            if match_links(database, self._aliases, links, config, threads=self._threads):
+                start = self._write_start(mapped)
+
+                def extend(copy: Path) -> list[Any]:
+                    return [*self._map(copy, at, start=start, extends_only=True), *apart]
+
+                mapped = register_without_pairs_against_gps(mapped, database, ground_m, extend)
+                posed = _numbers(mapped.models[:1])
+        rest = sorted(set(range(count)) - posed - _numbers(apart))
+        if not rest:
+            return mapped
+        match_remaining(database, self._aliases, rest, posed, matched, config, threads=self._threads)
+        start = self._write_start(mapped)
+
+        def map_weakly(copy: Path) -> list[Any]:
+            models = self._map(copy, at, allow_weak_links=True, start=start, apart=apart)
+            return sorted([*models, *apart], key=model_rank, reverse=True)
+
+        return register_without_pairs_against_gps(mapped, database, ground_m, map_weakly)
+
+    def _write_start(self, mapped: MappedModels) -> Path | None:
+        """Write the largest model, for a mapping to go on from, and return its folder."""
+        if not mapped.models:
+            return None
+        start = self._work / "start"
+        write_model(mapped.models[0], start)
+        return start
 
     def _map(
         self,
@@ -291,6 +300,8 @@ class PoseSearch:
         *,
         allow_weak_links: bool = False,
         start: Path | None = None,
+        apart: Sequence[Any] = (),
+        extends_only: bool = False,
     ) -> list[Any]:
         seed = self._config.seed
         if not self._config.is_large(len(self._names)):
@@ -307,6 +318,8 @@ class PoseSearch:
             on_count=at,
             allow_weak_links=allow_weak_links,
             start=start,
+            apart=apart,
+            extends_only=extends_only,
         )
 
     def _tell_stored_mapping(self, placed: int) -> None:
@@ -376,16 +389,10 @@ class PoseSearch:
 
         That means one lens as a rule, and a lens shared by all is found far more surely.
         """
-        infos = [self._infos[name] for name in self._names]
+        infos = map(self._infos.__getitem__, self._names)
         return len({(info.width_px, info.height_px) for info in infos}) == 1
 
-    def _warn_of_small_photographs(self) -> None:
-        infos = [self._infos[name] for name in self._names]
-        longest = max(max(info.width_px, info.height_px) for info in infos)
-        if longest < MIN_RECOMMENDED_SIDE_PX:
-            self._progress(
-                Warned(
-                    f"The photographs are {longest} px long at most; poses found from such small ones may be "
-                    "wrong, so give them at full size."
-                )
-            )
+
+def _numbers(models: Sequence[Any]) -> set[int]:
+    """Return the indices of the photographs that models place."""
+    return {number - 1 for model in models for number in model.reg_image_ids()}

@@ -11,7 +11,10 @@ import pytest
 from octasplat.engine.core.errors import DiskFullError
 from octasplat.engine.poses import incremental_mapping
 from octasplat.engine.poses.ambiguous_structure import remove_pairs
+from octasplat.engine.poses.config import PosesConfig
+from octasplat.engine.poses.features import photographs_of
 from octasplat.engine.poses.incremental_mapping import map_in_segments, map_photographs
+from octasplat.engine.poses.linking_pairs import match_links
 from octasplat.engine.poses.stored_mappings import (
     MAPPINGS_FOLDER,
     MappingState,
@@ -194,3 +197,55 @@ def test_full_disk_leaves_the_last_state(two_places: Path, tmp_path: Path, limit
     with files_no_larger_than(limit_bytes), pytest.raises(OSError, match="File too large"):
         store_mappings(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == [MAPPINGS_FOLDER]
+
+
+@pytest.mark.parametrize("weak", [False, True])
+def test_complete_models_are_not_mapped_again(two_places: Path, tmp_path: Path, weak: bool) -> None:
+    models = mapped(two_places, tmp_path / "first")
+    start = tmp_path / "start"
+    start.mkdir()
+    models[0].write_binary(start)
+    again = mapped(two_places, tmp_path / "again", start=start, apart=models[1:], allow_weak_links=weak)
+    extended = mapped(two_places, tmp_path / "extended", start=start, extends_only=True)
+    assert [model.num_reg_images() for model in (*again, *extended)] == [PHOTOGRAPHS, PHOTOGRAPHS]
+    assert models[1].reg_image_ids()[0] not in again[0].reg_image_ids()
+
+
+def test_model_takes_in_another_one_that_new_matches_link(two_places: Path, tmp_path: Path) -> None:
+    apart = tmp_path / "apart.db"
+    shutil.copyfile(two_places, apart)
+    half = PHOTOGRAPHS // 2 + 2
+    remove_pairs(
+        apart, np.array([(a, b) for a in range(1, half + 1) for b in range(half + 1, PHOTOGRAPHS + 1)])
+    )
+    models = mapped(apart, tmp_path / "first")
+    assert models[0].num_reg_images() == half
+    start = tmp_path / "start"
+    start.mkdir()
+    models[0].write_binary(start)
+    counted: list[int] = []
+    (extended,) = map_in_segments(
+        two_places, StoredMapping(tmp_path / "again", MATCHES, ignore_count), seed=0, on_count=counted.append,
+        start=start, extends_only=True,
+    )  # fmt: skip
+    assert set(extended.reg_image_ids()) == set(range(1, PHOTOGRAPHS + 1))
+    assert counted == list(range(half + 1, PHOTOGRAPHS + 1))
+
+
+def test_links_of_models_are_those_that_one_geometry_explains(two_places: Path, tmp_path: Path) -> None:
+    database = tmp_path / "database.db"
+    shutil.copyfile(two_places, database)
+    names = photographs_of(database)
+    first, other = range(PHOTOGRAPHS), range(PHOTOGRAPHS, len(names))
+    linked = [(0, k) for k in first if k]
+    remove_pairs(database, np.array(linked) + 1)
+    with pycolmap.Database.open(database) as opened:
+        opened.clear_matches()
+
+    def found(pairs: list[tuple[int, int]], min_inliers: int = 100) -> bool:
+        return match_links(database, names, pairs, PosesConfig(), min_inliers=min_inliers, threads=1)
+
+    assert not found([(0, k) for k in other])
+    assert not found([])
+    assert not found(linked, min_inliers=100_000)
+    assert found(linked)

@@ -121,8 +121,8 @@ def test_unfinished_content_is_not_seen(storage: Storage, size: int) -> None:
 @pytest.mark.parametrize("announced", [False, True])
 def test_sweep_removes_killed_uploads(storage: Storage, announced: bool) -> None:
     data = noise(9 * MIB)
-    writer = storage.open_writer(sha256=digest(data) if announced else None)
-    writer.write(data)  # and then the process is killed
+    writer = storage.open_writer(sha256=digest(data) if announced else None, max_bytes=32 * MIB)
+    writer.write(data)  # more than one part, and then the process is killed
     if not isinstance(storage, S3Storage):
         assert (
             storage.remove_stale_uploads(3600) == 0
