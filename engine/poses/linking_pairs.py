@@ -26,14 +26,21 @@ NEIGHBORS_BY_NAME = 15
 
 
 def propose_links(
-    database: Path, rest: Sequence[int], posed: Collection[int], excluded: Collection[Pair], *, seed: int
+    database: Path,
+    count: int,
+    rest: Sequence[int],
+    posed: Collection[int],
+    excluded: Collection[Pair],
+    *,
+    seed: int,
 ) -> list[Pair]:
     """Return pairs of a photograph left out and one that has a pose, the lower index first, in order.
 
     Args:
         database: with features; is only read.
-        rest: photographs left out.
-        posed: all others.
+        count: photographs in all.
+        rest: those to be linked.
+        posed: those that have poses.
         excluded: pairs that were matched already.
         seed: of the vocabulary.
     """
@@ -53,7 +60,6 @@ def propose_links(
         nearest = located[np.argsort(away_m, kind="stable")].tolist()
         found |= _first_pairs(k, nearest, tried)
     if by_look:
-        count = len(rest) + len(posed)
         small = database.with_name("links.db")
         small.unlink(missing_ok=True)
         copy_largest_features(database, small, count, PRESELECTION_FEATURES)
@@ -96,7 +102,7 @@ def match_remaining(
     """
     if config.is_large(len(names)):
         near = pairs_with(rest, len(names), matched, within=NEIGHBORS_BY_NAME)
-        pairs = sorted({*near, *propose_links(database, rest, posed, matched, seed=config.seed)})
+        pairs = sorted({*near, *propose_links(database, len(names), rest, posed, matched, seed=config.seed)})
     else:
         pairs = pairs_with(rest, len(names), matched)
     match_pairs(database, names, pairs, config, thorough=True, threads=threads, on_count=lambda _done: None)

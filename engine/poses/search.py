@@ -264,7 +264,7 @@ class PoseSearch:
         apart = mapped.models[1:] if config.is_large(count) else []
         posed = _numbers(mapped.models[:1])
         if of_others := sorted(_numbers(apart) - posed):
-            links = propose_links(database, of_others, posed, matched, seed=config.seed)
+            links = propose_links(database, count, of_others, posed, matched, seed=config.seed)
             if match_links(database, self._aliases, links, config, threads=self._threads):
                 start = self._write_start(mapped)
 

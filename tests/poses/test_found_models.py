@@ -224,7 +224,7 @@ def test_photographs_left_out_are_linked_to_the_nearest_with_poses(tmp_path: Pat
     rest = [40, 41]
     posed = set(range(count)) - set(rest)
     matched = [(39, 40), (40, 42)]
-    links = propose_links(tmp_path / "a.db", rest, posed, matched, seed=0)
+    links = propose_links(tmp_path / "a.db", count, rest, posed, matched, seed=0)
     assert links == sorted(links) and not set(links) & {*matched, (40, 41)}
     of_first = sorted({*a} - {40} for a in links if 40 in a)
     assert len(of_first) == LINKS_PER_PHOTOGRAPH and len(links) == 2 * LINKS_PER_PHOTOGRAPH

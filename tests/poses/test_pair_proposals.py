@@ -8,6 +8,7 @@ import pytest
 
 from octasplat.engine.poses.config import PosesConfig
 from octasplat.engine.poses.features import create_database, preselect_pairs
+from octasplat.engine.poses.linking_pairs import propose_links
 from octasplat.engine.poses.pair_proposals import propose_pairs
 from octasplat.engine.poses.pairs import all_pairs, pair_count, pairs_with, select_pairs
 from tests.support.located_scene import write_gps
@@ -96,3 +97,19 @@ def test_pairs_of_neighbors_and_of_those_left_out() -> None:
     ]  # fmt: skip
     assert pairs_with([4], 6, [(3, 4)]) == [(0, 4), (1, 4), (2, 4), (4, 5)]
     assert pairs_with([4], 6, [(3, 4)], within=2) == [(2, 4), (4, 5)]
+
+
+def test_photographs_of_one_model_are_linked_by_look_to_those_of_another(
+    street: tuple[Path, list[str], np.ndarray],
+) -> None:
+    path, _, place = street
+    by_place = np.argsort(place).tolist()
+    rest, posed, of_no_model = by_place[:20], by_place[20:50], by_place[50:]
+    at_the_border, behind_it = by_place[19], by_place[20]
+    matched = [(min(by_place[18], behind_it), max(by_place[18], behind_it))]
+    links = propose_links(path, COUNT, rest, posed, matched, seed=0)
+    assert links == sorted(links)
+    assert (min(at_the_border, behind_it), max(at_the_border, behind_it)) in links
+    assert not set(links) & {*matched}
+    assert {(a in rest) + 2 * (b in rest) for a, b in links} <= {1, 2}
+    assert not {k for pair in links for k in pair} & {*of_no_model}
