@@ -17,6 +17,7 @@ from octasplat.engine.blocks.block_merge import (
 from octasplat.engine.blocks.block_plan import Block, plan_blocks
 from octasplat.engine.blocks.piece_progress import PieceProgress
 from octasplat.engine.blocks.piece_settings import (
+    block_iterations,
     block_margin,
     block_settings,
     coarse_settings,
@@ -39,11 +40,7 @@ from octasplat.engine.core.events import Noted
 from octasplat.engine.core.threads import use_threads
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.dataset.view_tiles import Rectangles
-from octasplat.engine.train.config import (
-    TrainConfig,
-    iteration_count,
-    min_tile_side_px,
-)
+from octasplat.engine.train.config import TrainConfig, min_tile_side_px
 from octasplat.engine.train.initialization.initial_gaussians import initial_train_state
 from octasplat.engine.train.loop.checkpoint import BestState, load_best
 from octasplat.engine.train.loop.state import TrainState, initial_state
@@ -114,7 +111,11 @@ def plan_scene(
         config = block_settings(
             work.config, block.share, most_gaussians, is_finished_later=is_finished_together
         )
-        lengths.append(_block_iterations(work, block.pixels, config) if block.is_trained else 0)
+        lengths.append(
+            _block_iterations(work, block.pixels, config, is_finished_later=is_finished_together)
+            if block.is_trained
+            else 0
+        )
     plan = ScenePlan(
         blocks,
         tuple(lengths),
@@ -159,7 +160,7 @@ def train_block(work: BlockWork, plan: ScenePlan, number: int, tell: PieceProgre
     is_trained = block.trained.contains(scene.means_world)
     config = block_settings(
         work.config, block.share, plan.most_gaussians, is_finished_later=plan.is_finished_together
-    )
+    ).model_copy(update={"iterations": plan.iterations[number - 1]})
 
     def start() -> TrainState:
         pixels_text = f"{block.pixels.pixel_count / 1e6:.1f} million pixels of {block.view_count} photographs"
@@ -180,7 +181,7 @@ def _guess_iterations(work: BlockWork, count: int, most_gaussians: int | None) -
     share = min(1.0, (1 + 2 * block_margin(is_finished_later=is_finished_together)) / count)
     pixels = max(1, round(share * work.dataset.train_pixel_count))
     config = block_settings(work.config, share, most_gaussians, is_finished_later=False)
-    lengths = [iteration_count(config, pixels)] * count
+    lengths = [block_iterations(config, pixels, is_finished_later=is_finished_together)] * count
     last = (
         {FINISH: finish_iterations(lengths)}
         if is_finished_together
@@ -210,9 +211,11 @@ def _is_finished_together(work: BlockWork, most_gaussians: int | None) -> bool:
     return fits_together(work.config, dataset.train_pixel_count, most_gaussians, valid)
 
 
-def _block_iterations(work: BlockWork, pixels: Rectangles, config: TrainConfig) -> int:
-    data = BlockDataset(work.dataset, pixels)
-    return iteration_count(config, pixels.drawn_pixel_count, valid_pixel_fraction(data))
+def _block_iterations(
+    work: BlockWork, pixels: Rectangles, config: TrainConfig, *, is_finished_later: bool
+) -> int:
+    valid = valid_pixel_fraction(BlockDataset(work.dataset, pixels))
+    return block_iterations(config, pixels.drawn_pixel_count, valid, is_finished_later=is_finished_later)
 
 
 def _guess_polish_iterations(config: TrainConfig, blocks: Sequence[Block]) -> int:

@@ -9,6 +9,7 @@ from octasplat.engine.train.config import (
     LearningRates,
     McmcConfig,
     TrainConfig,
+    iteration_count,
     max_gaussian_count,
     uses_shared_sort,
 )
@@ -39,12 +40,12 @@ POLISH_FRACTION = 0.1
 """Iterations of the polish, of those that an ordinary training of its pixels takes."""
 DECAYING_RATES = ("quat", "log_scale", "opacity", "color", "exposure", "background")
 """Rates that fall to a share of their first size."""
-FINISH_FROM = 0.7
+FINISH_FROM = 0.35
 """Share of the schedule of a training that blocks go through where all of them are finished together."""
-FINISH_FRACTION = 1 / 3
+FIRST_PART = 1 / 2
+"""Iterations of such a block, of those that it would take by itself."""
+FINISH_FRACTION = 5 / 3
 """Iterations of finishing all blocks together, of those of the blocks."""
-FINISH_AVERAGING_START = 0.5
-"""Share of them after which states are averaged."""
 
 
 def fewest_blocks(
@@ -180,7 +181,7 @@ def block_margin(*, is_finished_later: bool) -> float:
 def finish_settings(config: TrainConfig, iterations: int, of_blocks: Sequence[int] = ()) -> TrainConfig:
     """Return the settings of finishing all blocks together: the rest of the schedule that they began.
 
-    Nothing is added or moved elsewhere any more. Exposures and background are learnt again.
+    Exposures and background are learnt again.
 
     Args:
         config: of the run.
@@ -191,20 +192,48 @@ def finish_settings(config: TrainConfig, iterations: int, of_blocks: Sequence[in
     # each rate goes on from where the blocks' has ended
     begun = {name: getattr(lr, name) * lr.decay for name in DECAYING_RATES}
     rates = {**begun, "mean": lr.mean_final, "mean_final": config.lr.mean_final}
-    rest = (config.shared_sort_until - FINISH_FROM) / (1 - FINISH_FROM)
-    # of 1 the last state is wanted
-    averaging_start = FINISH_AVERAGING_START if config.weight_averaging_start < 1 else 1.0
+    densify = config.densify
+    moves: dict[str, object] = {"start": 0, "stop_fraction": _share_of_rest(densify.stop_fraction)}
+    if isinstance(densify, McmcConfig):
+        rounds = densify.relocate_low_weight_rounds
+        moves["relocate_low_weight_rounds"] = max(1, rounds - _rounds_of_first_part(rounds))
     return config.model_copy(
         update={
             "iterations": iterations,
-            "densify_from_iter": iterations + 1,
+            "densify_from_iter": 0,
+            "densify": densify.model_copy(update=moves),
             "opacity_decay": None,
             "early_stopping_db": 0.0,
-            "shared_sort_until": max(0.0, rest),
-            "weight_averaging_start": averaging_start,
+            "shared_sort_until": _share_of_rest(config.shared_sort_until),
+            "weight_averaging_start": _share_of_rest(config.weight_averaging_start),
             "lr": lr.model_copy(update={**rates, "decay": config.lr.decay / lr.decay, "scale_after": 0}),
         }
     )
+
+
+def _share_of_rest(share: float) -> float:
+    """Return where ``share`` of the whole schedule lies in what is left of it after ``FINISH_FROM``."""
+    return max(0.0, (share - FINISH_FROM) / (1 - FINISH_FROM))
+
+
+def _rounds_of_first_part(rounds: int) -> int:
+    """Return how many of so many rounds blocks go through, so that they are as far apart."""
+    return max(1, round(FINISH_FROM * rounds))
+
+
+def block_iterations(
+    config: TrainConfig, pixels: int, valid_fraction: float = 1.0, *, is_finished_later: bool
+) -> int:
+    """Return the iterations of a block.
+
+    Args:
+        config: of the block, see :func:`block_settings`.
+        pixels: that it is trained on, those drawn less often counted less.
+        valid_fraction: share of them that shows anything.
+        is_finished_later: whether all blocks are finished together, see :func:`fits_together`.
+    """
+    count = iteration_count(config, pixels, valid_fraction)
+    return max(1, round(FIRST_PART * count)) if is_finished_later else count
 
 
 def finish_iterations(of_blocks: Sequence[int]) -> int:
@@ -217,8 +246,8 @@ def _first_part(config: TrainConfig) -> TrainConfig:
     lr, densify = config.lr, config.densify
     mean_final = lr.mean * (lr.mean_final / lr.mean) ** FINISH_FROM
     fewer: dict[str, object] = {"stop_fraction": min(1.0, densify.stop_fraction / FINISH_FROM)}
-    if isinstance(densify, McmcConfig):  # rounds of the whole schedule, so that they are as far apart
-        fewer["relocate_low_weight_rounds"] = max(1, round(FINISH_FROM * densify.relocate_low_weight_rounds))
+    if isinstance(densify, McmcConfig):
+        fewer["relocate_low_weight_rounds"] = _rounds_of_first_part(densify.relocate_low_weight_rounds)
     return config.model_copy(
         update={
             "shared_sort_until": min(1.0, config.shared_sort_until / FINISH_FROM),

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from octasplat.engine.blocks.piece_settings import (
     FINISH_FRACTION,
+    FIRST_PART,
     POLISH_FRACTION,
     block_margin,
     block_settings,
@@ -104,8 +105,10 @@ def estimate_blocks(
     around = [round((1 - block.share) * coarse_count) for block in shares]
     merged_count = round(sum(counts) / max(1.0, sum(block.share for block in shares)))
     block_seconds, last_pieces = [], []
+    is_finished_together = fits_together(config.train, training_pixels(config, photographs), most_gaussians)
+    part = FIRST_PART if is_finished_together else 1.0
     for seconds, count, others in zip(alone, counts, around, strict=True):
-        block_seconds.append(seconds * ray_cost_growth(config.train, count, count + others))
+        block_seconds.append(part * seconds * ray_cost_growth(config.train, count, count + others))
         last_pieces.append(seconds * ray_cost_growth(config.train, count, max(count, merged_count)))
     costs = tuple(
         cost.model_copy(
@@ -117,8 +120,8 @@ def estimate_blocks(
         for cost, seconds, before in zip(costs, block_seconds, alone, strict=True)
     )
     last_seconds = POLISH_FRACTION * max(last_pieces)
-    if fits_together(config.train, training_pixels(config, photographs), most_gaussians):
-        last_seconds = FINISH_FRACTION * sum(last_pieces)
+    if is_finished_together:
+        last_seconds = FINISH_FRACTION * FIRST_PART * sum(last_pieces)
         block_bytes.append(whole.memory_bytes)
     # photographs are decoded once more, smaller, for the coarse scene
     extra = coarse.stage_seconds["load"] + coarse.stage_seconds["train"] + last_seconds

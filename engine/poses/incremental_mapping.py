@@ -29,10 +29,8 @@ _MIN_SEGMENT = 250
 """Photographs of the first segment at least ..."""
 _SEGMENT_GROWTH = 1.2
 """... and by which a model grows in any further one."""
-USUAL_INLIERS = 30
-"""Matches by which a photograph can be placed ..."""
 _WEAK_INLIERS = 15
-"""... and those where these leave some out."""
+"""Matches by which a photograph can be placed where the usual 30 leave some out."""
 _WEAK_INITIAL_INLIERS = 50
 """The same for the first two."""
 
@@ -110,7 +108,9 @@ def map_in_segments(
     count = _Count(on_count)
     while not stored.state.is_done:
         _map_segment(options, database, stored, start, apart, count)
-    return sorted(stored.models(), key=model_rank, reverse=True)
+    models = stored.models()
+    count.reach(_placed_count([*apart, *models]))
+    return sorted(models, key=model_rank, reverse=True)
 
 
 def _map_segment(
@@ -148,7 +148,6 @@ def _options(seed: int, allow_weak_links: bool) -> Any:
     # It tries photographs whose points are not known yet by RANSAC of a solver that takes milliseconds, up to
     # minutes for each photograph that matches falsely, as all do of another place.
     options.structure_less_registration_fallback = False
-    options.mapper.abs_pose_min_num_inliers = USUAL_INLIERS
     options.extract_colors = False  # extracted once, for the model that is kept
     if allow_weak_links:
         options.mapper.abs_pose_min_num_inliers = _WEAK_INLIERS
@@ -253,9 +252,13 @@ class _Count:
     def add(self) -> None:
         """Count one photograph."""
         self._placed += 1
-        if self._placed > self._most:
-            self._most = self._placed
-            self._on_count(self._most)
+        self.reach(self._placed)
+
+    def reach(self, placed: int) -> None:
+        """Tell of so many photographs if they are more than before."""
+        if placed > self._most:
+            self._most = placed
+            self._on_count(placed)
 
 
 def _all_models(manager: Any) -> list[Any]:

@@ -15,12 +15,16 @@ import pycolmap
 
 from octasplat.engine.poses.config import PRESELECTION_FEATURES, PRESELECTION_MATCHES, PosesConfig
 from octasplat.engine.poses.features import copy_largest_features, look_at_pairs, match_pairs
-from octasplat.engine.poses.incremental_mapping import USUAL_INLIERS
 from octasplat.engine.poses.pair_proposals import alike_by_vocabulary, gps_positions_m
 from octasplat.engine.poses.pairs import Pair, pairs_with
 
 LINKS_PER_PHOTOGRAPH = 30
 """Photographs with poses that one without is matched with."""
+MAX_LINKS = 500
+"""Pairs of photographs of two models that are matched, those that look most alike."""
+MIN_LINK_INLIERS = 100
+"""Matches by which a pair links two models: two that are right are better than one that is folded. Of 2,600
+pairs of a street whose sides look alike, 85 have 30 false matches and more, and none has 60."""
 NEIGHBORS_BY_NAME = 15
 """Photographs on either side by name that it is matched with besides, with poses or not."""
 
@@ -115,9 +119,9 @@ def match_links(
     config: PosesConfig,
     *,
     threads: int,
-    min_inliers: int = USUAL_INLIERS,
+    min_inliers: int = MIN_LINK_INLIERS,
 ) -> bool:
-    """Match those pairs of photographs of two models that a quick look finds alike.
+    """Match those pairs of photographs of two models that a quick look finds most alike.
 
     Args:
         database: with features; gets the matches.
@@ -125,7 +129,7 @@ def match_links(
         pairs: indices into ``names``.
         config: settings.
         threads: to use; -1 means all cores.
-        min_inliers: matches of one geometry by which a photograph can be placed.
+        min_inliers: matches of one geometry by which a pair links the models.
 
     Returns:
         Whether any of the pairs has so many.
@@ -135,9 +139,10 @@ def match_links(
     copy_largest_features(database, small, len(names), PRESELECTION_FEATURES)
     looked = look_at_pairs(small, names, pairs, threads=threads)
     small.unlink()
-    alike = sorted(pair for pair, matches in looked.items() if matches >= PRESELECTION_MATCHES)
-    match_pairs(database, names, alike, config, thorough=False, threads=threads, on_count=lambda _done: None)
+    alike = [pair for pair in sorted(looked) if looked[pair] >= PRESELECTION_MATCHES]
+    best = sorted(alike, key=lambda pair: -looked[pair])[:MAX_LINKS]
+    match_pairs(database, names, best, config, thorough=False, threads=threads, on_count=lambda _done: None)
     with pycolmap.Database.open(database) as matched:
         return any(
-            len(matched.read_two_view_geometry(a + 1, b + 1).inlier_matches) >= min_inliers for a, b in alike
+            len(matched.read_two_view_geometry(a + 1, b + 1).inlier_matches) >= min_inliers for a, b in best
         )

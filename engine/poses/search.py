@@ -172,7 +172,7 @@ class PoseSearch:
             )
             if best_rank(mapped.models)[0] < count:
                 mapped = self._register_remaining(database, mapped, matched, ground_m, at)
-            at(best_rank(mapped.models)[0])
+            at(mapped.placed(count))
         return mapped
 
     def _find_features(self, database: Path, thorough: bool) -> None:
@@ -257,8 +257,7 @@ class PoseSearch:
     ) -> MappedModels:
         """Register photographs that the largest model leaves out.
 
-        For those of no model fewer matches are required. Other models of a large capture join the largest one
-        only by as many matches as any photograph.
+        For those of no model fewer matches are required, for other models of a large capture more.
         """
         config, count = self._config, len(self._names)
         apart = mapped.models[1:] if config.is_large(count) else []

@@ -15,9 +15,11 @@ from octasplat.engine.blocks.block_map import SIDE_PX, draw_block_map
 from octasplat.engine.blocks.block_plan import Block
 from octasplat.engine.blocks.partition import Box
 from octasplat.engine.blocks.piece_settings import (
+    block_iterations,
     block_margin,
     block_settings,
     fewest_blocks,
+    finish_iterations,
     finish_settings,
     fits_together,
     polish_settings,
@@ -166,7 +168,18 @@ def test_blocks_finished_later_move_gaussians_as_far_apart_as_the_whole_schedule
             assert isinstance(densify, McmcConfig)
             rounds[given, is_finished_later] = densify.relocate_low_weight_rounds
     assert [rounds[given, False] for given in (1, 16, 40)] == [1, 16, 40]
-    assert [rounds[given, True] for given in (1, 16, 40)] == [1, 11, 28]
+    assert [rounds[given, True] for given in (1, 16, 40)] == [1, 6, 14]
+    rest = finish_settings(config, 100).densify  # the others, as far as the whole schedule moves any
+    assert isinstance(rest, McmcConfig) and rest.relocate_low_weight_rounds == 40 - 14
+    assert 0.35 + 0.65 * rest.stop_fraction == pytest.approx(config.densify.stop_fraction)
+
+
+def test_blocks_finished_later_and_the_finish_take_as_long_as_blocks_and_a_third() -> None:
+    config = TrainConfig(iterations=1000)
+    alone = block_iterations(config, 10**6, is_finished_later=False)
+    first = block_iterations(config, 10**6, is_finished_later=True)
+    assert (alone, first) == (1000, 500)
+    assert 2 * first + finish_iterations([first, first]) == pytest.approx(4 / 3 * 2 * alone, abs=1)
 
 
 @pytest.mark.parametrize(
@@ -196,7 +209,8 @@ def test_blocks_share_less_with_narrower_margins_and_nothing_without(scene: Path
 
 def test_finish_averages_states_unless_the_settings_forbid_it() -> None:
     default, last_state = TrainConfig(), TrainConfig(weight_averaging_start=1)
-    assert finish_settings(default, 100).weight_averaging_start == 0.5
+    start = finish_settings(default, 100).weight_averaging_start
+    assert 0.35 + 0.65 * start == pytest.approx(default.weight_averaging_start)
     fading = default.model_copy(update={"opacity_decay": 0.99})  # which is for the first half alone
     assert finish_settings(fading, 100).opacity_decay is polish_settings(fading, 100).opacity_decay is None
     for settings in (

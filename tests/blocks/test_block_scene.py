@@ -167,11 +167,11 @@ def test_progress_counts_all_trainings(two_blocks: tuple) -> None:
     run, events = two_blocks
     told = [event for event in events if isinstance(event, TrainingProgress)]
     assert [event.iteration for event in told] == sorted(event.iteration for event in told)
-    assert told[-1].iteration == told[-1].total_iterations == 150 + 300 * 2 + 200
+    assert told[-1].iteration == told[-1].total_iterations == 150 + 150 * 2 + 500
     assert told[-1].seconds_left == 0
     # held-out views are those of the whole scene at its full size: of the coarse one nothing is told
     measured = [event for event in events if isinstance(event, HeldOutMeasured)]
-    assert measured[0].iteration == 150 + 300 * 2 and measured[-1].iteration == told[-1].iteration
+    assert measured[0].iteration == 150 + 150 * 2 and measured[-1].iteration == told[-1].iteration
     assert measured[0].seconds <= measured[-1].seconds <= told[-1].seconds + 1
     record = json.loads((run / "training.json").read_text())
     assert record["iterations"] == 950

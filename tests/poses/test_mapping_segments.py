@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 
 from octasplat.engine.core.errors import DiskFullError
-from octasplat.engine.poses import incremental_mapping
+from octasplat.engine.poses import incremental_mapping, linking_pairs
 from octasplat.engine.poses.ambiguous_structure import remove_pairs
 from octasplat.engine.poses.config import PosesConfig
 from octasplat.engine.poses.features import photographs_of
@@ -103,6 +103,11 @@ def test_segments_give_the_models_of_one_run(two_places: Path, tmp_path: Path) -
     )
     assert counted == COUNTED
     assert len(states) >= 4
+    counted.clear()
+    map_in_segments(
+        two_places, StoredMapping(tmp_path, MATCHES, ignore_count), seed=0, on_count=counted.append
+    )
+    assert counted == COUNTED[-1:]  # of a mapping that is done
     whole = map_photographs(two_places, seed=0, on_count=ignore_count)
     assert [sorted(model.reg_image_ids()) for model in models] == [
         sorted(model.reg_image_ids()) for model in whole
@@ -242,10 +247,26 @@ def test_links_of_models_are_those_that_one_geometry_explains(two_places: Path, 
     with pycolmap.Database.open(database) as opened:
         opened.clear_matches()
 
-    def found(pairs: list[tuple[int, int]], min_inliers: int = 100) -> bool:
-        return match_links(database, names, pairs, PosesConfig(), min_inliers=min_inliers, threads=1)
+    def found(pairs: list[tuple[int, int]]) -> bool:
+        return match_links(database, names, pairs, PosesConfig(), threads=1)
 
     assert not found([(0, k) for k in other])
     assert not found([])
-    assert not found(linked, min_inliers=100_000)
     assert found(linked)
+    assert not match_links(database, names, linked, PosesConfig(), threads=1, min_inliers=100_000)
+
+
+def test_only_the_pairs_that_look_most_alike_are_matched_as_links(
+    two_places: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(linking_pairs, "MAX_LINKS", 3)
+    database = tmp_path / "database.db"
+    shutil.copyfile(two_places, database)
+    with pycolmap.Database.open(database) as opened:
+        opened.clear_matches()
+        opened.clear_two_view_geometries()
+    names = photographs_of(database)
+    pairs = [(0, k) for k in range(1, PHOTOGRAPHS)]
+    assert match_links(database, names, pairs, PosesConfig(), threads=1)
+    with pycolmap.Database.open(database) as opened:
+        assert opened.num_verified_image_pairs() == 3
