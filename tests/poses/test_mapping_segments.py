@@ -232,6 +232,20 @@ def test_model_takes_in_another_one_that_new_matches_link(two_places: Path, tmp_
     assert counted == list(range(half + 1, PHOTOGRAPHS + 1))
 
 
+def test_photographs_that_models_share_are_counted_once(two_places: Path, tmp_path: Path) -> None:
+    models = mapped(two_places, tmp_path / "first")
+    start = tmp_path / "start"
+    start.mkdir()
+    models[0].write_binary(start)
+    counted: list[int] = []
+    (_, other) = map_in_segments(
+        two_places, StoredMapping(tmp_path / "again", MATCHES, ignore_count), seed=0, on_count=counted.append,
+        start=start, apart=models[:1],
+    )  # fmt: skip
+    assert other.num_reg_images() == PHOTOGRAPHS // 2
+    assert counted == COUNTED[PHOTOGRAPHS - 2 :]
+
+
 def test_links_of_models_are_those_that_one_geometry_explains(two_places: Path, tmp_path: Path) -> None:
     database = tmp_path / "database.db"
     shutil.copyfile(two_places, database)
