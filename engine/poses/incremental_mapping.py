@@ -4,7 +4,7 @@ Bundle adjustment adds up in the order in which its threads come, so more of the
 now and then other photographs; most of the mapper runs on one thread anyway.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,11 @@ _WEAK_INLIERS = 15
 """Matches by which a photograph can be placed where the usual 30 leave some out."""
 _WEAK_INITIAL_INLIERS = 50
 """The same for the first two."""
+
+
+_MIN_SEEN_POINTS = 30
+"""Points that a photograph placed so has to see in a large capture, whose places may look alike: in a street
+ten false ones saw 20 and less, and right ones 60 and more."""
 
 
 class _SegmentEndError(Exception):
@@ -109,7 +114,7 @@ def map_in_segments(
     while not stored.state.is_done:
         _map_segment(options, database, stored, start, apart, count)
     models = stored.models()
-    count.reach(_placed_count([*apart, *models]))
+    count.tell(len(_placed([*apart, *models])))
     return sorted(models, key=model_rank, reverse=True)
 
 
@@ -128,7 +133,7 @@ def _map_segment(
     finished = [*apart, *stored.models()]
     options.image_names = _names_left(database, finished, _all_models(manager))
     is_segment_end = _run_mapper(
-        options, database, manager, count, ends_segments=True, finished_count=_placed_count(finished)
+        options, database, manager, count, ends_segments=True, finished=_placed(finished)
     )
     models = _all_models(manager)
     if is_segment_end:
@@ -162,7 +167,7 @@ def _run_mapper(
     count: "_Count",
     *,
     ends_segments: bool = False,
-    finished_count: int = 0,
+    finished: frozenset[int] = frozenset(),
 ) -> bool:
     """Run COLMAP's mapper, with a model in ``manager`` to go on from or without; return where it ends.
 
@@ -173,7 +178,7 @@ def _run_mapper(
         count: counts the photographs.
         ends_segments: stop after an adjustment of all photographs of a model that has grown by
             :data:`_SEGMENT_GROWTH`.
-        finished_count: photographs of models that are complete.
+        finished: numbers of the photographs of models that are complete; of segments, all models count.
 
     Returns:
         Whether that was the end of a segment; the last model is not complete then.
@@ -184,19 +189,24 @@ def _run_mapper(
     begun = manager.get(0).num_reg_frames() if manager.size() else 0
     adjusted = (begun, manager.get(0).num_points3D()) if begun else (0, 0)
     segment_end: float = max(_SEGMENT_GROWTH * begun, _MIN_SEGMENT)
-    count.begin(finished_count + begun)
+
+    def placed() -> int:
+        models = _all_models(manager)
+        # models share photographs
+        return len(finished | _placed(models)) if ends_segments else models[-1].num_reg_images()
+
+    count.begin(placed() if begun else len(finished))
 
     def first_pair() -> None:
         nonlocal adjusted, segment_end
         model = manager.get(manager.size() - 1)
         adjusted = model.num_reg_frames(), model.num_points3D()
         segment_end = _MIN_SEGMENT  # of a new model
-        models = _all_models(manager) if ends_segments else [model]
-        count.begin(finished_count + _placed_count(models))
+        count.begin(placed())
 
     def another() -> None:
         nonlocal adjusted
-        count.add()
+        count.tell(placed())
         if not ends_segments:
             return
         model = manager.get(manager.size() - 1)
@@ -221,6 +231,19 @@ def _run_mapper(
     return is_segment_end
 
 
+def take_out_unsure(model: Any, sure: Collection[int]) -> None:
+    """Take photographs that see few points of a model out of it.
+
+    Args:
+        model: a ``pycolmap.Reconstruction``, which is changed.
+        sure: numbers of the photographs that stay in any case.
+    """
+    for number in sorted(set(model.reg_image_ids()) - set(sure)):
+        image = model.image(number)
+        if image.num_points3D < _MIN_SEEN_POINTS:
+            model.deregister_frame(image.frame_id)
+
+
 def _adjust_complete(model: Any, matches: Any, options: Any) -> None:
     """Adjust all photographs of a complete model until the cost hardly falls any more."""
     adjustment = options.get_global_bundle_adjustment()
@@ -242,20 +265,14 @@ class _Count:
 
     def __init__(self, on_count: OnCount) -> None:
         self._on_count = on_count
-        self._placed = self._most = 0
+        self._most = 0
 
     def begin(self, placed: int) -> None:
         """Count from here on."""
-        self._placed = placed
         self._most = max(self._most, placed)
 
-    def add(self) -> None:
-        """Count one photograph."""
-        self._placed += 1
-        self.reach(self._placed)
-
-    def reach(self, placed: int) -> None:
-        """Tell of so many photographs if they are more than before."""
+    def tell(self, placed: int) -> None:
+        """Tell of so many photographs, if they are more than before."""
         if placed > self._most:
             self._most = placed
             self._on_count(placed)
@@ -265,8 +282,9 @@ def _all_models(manager: Any) -> list[Any]:
     return [manager.get(k) for k in range(manager.size())]
 
 
-def _placed_count(models: Sequence[Any]) -> int:
-    return sum(model.num_reg_images() for model in models)
+def _placed(models: Sequence[Any]) -> frozenset[int]:
+    """Return the numbers of the photographs of models, which may share some."""
+    return frozenset(number for model in models for number in model.reg_image_ids())
 
 
 def _names_left(database: Path, finished: Sequence[Any], current: Sequence[Any]) -> list[str]:
@@ -278,8 +296,7 @@ def _names_left(database: Path, finished: Sequence[Any], current: Sequence[Any])
         return []
     with pycolmap.Database.open(database) as source:
         names = {image.image_id: image.name for image in source.read_all_images()}
-    placed = {number for model in finished for number in model.reg_image_ids()}
-    kept = {number for model in current for number in model.reg_image_ids()}
+    placed, kept = _placed(finished), _placed(current)
     return sorted(name for number, name in names.items() if number not in placed or number in kept)
 
 

@@ -26,6 +26,11 @@ def distinct_models(models: Sequence[Any]) -> list[Any]:
     return kept
 
 
+def photograph_indices(models: Sequence[Any]) -> set[int]:
+    """Return the indices, from 0, of the photographs that models place."""
+    return {number - 1 for model in models for number in model.reg_image_ids()}
+
+
 def is_trustworthy(model: Any) -> bool:
     """Return whether a model has enough points, and these fit the photographs."""
     return model.num_points3D() >= MIN_POINTS and (

@@ -43,9 +43,10 @@ from octasplat.engine.poses.incremental_mapping import (
     map_in_segments,
     map_photographs,
     model_rank,
+    take_out_unsure,
 )
 from octasplat.engine.poses.linking_pairs import match_links, match_remaining, propose_links
-from octasplat.engine.poses.model_selection import distinct_models, model_facts
+from octasplat.engine.poses.model_selection import distinct_models, model_facts, photograph_indices
 from octasplat.engine.poses.pairs import Pair, all_pairs, pair_count
 from octasplat.engine.poses.photograph_check import (
     check_photographs_decode,
@@ -257,12 +258,12 @@ class PoseSearch:
     ) -> MappedModels:
         """Register photographs that the largest model leaves out.
 
-        For those of no model fewer matches are required, for other models of a large capture more.
+        Those of no model that is kept need fewer matches, other models of a large capture more.
         """
         config, count = self._config, len(self._names)
-        apart = mapped.models[1:] if config.is_large(count) else []
-        posed = _numbers(mapped.models[:1])
-        if of_others := sorted(_numbers(apart) - posed):
+        apart = self._kept_apart(mapped)
+        posed = photograph_indices(mapped.models[:1])
+        if of_others := sorted(photograph_indices(apart) - posed):
             links = propose_links(database, count, of_others, posed, matched, seed=config.seed)
             if match_links(database, self._aliases, links, config, threads=self._threads):
                 start = self._write_start(mapped)
@@ -271,8 +272,9 @@ class PoseSearch:
                     return [*self._map(copy, at, start=start, extends_only=True), *apart]
 
                 mapped = register_without_pairs_against_gps(mapped, database, ground_m, extend)
-                posed = _numbers(mapped.models[:1])
-        rest = sorted(set(range(count)) - posed - _numbers(apart))
+                posed = photograph_indices(mapped.models[:1])
+                apart = self._kept_apart(mapped)
+        rest = sorted(set(range(count)) - posed - photograph_indices(apart))
         if not rest:
             return mapped
         match_remaining(database, self._aliases, rest, posed, matched, config, threads=self._threads)
@@ -280,9 +282,15 @@ class PoseSearch:
 
         def map_weakly(copy: Path) -> list[Any]:
             models = self._map(copy, at, allow_weak_links=True, start=start, apart=apart)
+            for model in models if config.is_large(count) else []:
+                take_out_unsure(model, {k + 1 for k in posed})
             return sorted([*models, *apart], key=model_rank, reverse=True)
 
         return register_without_pairs_against_gps(mapped, database, ground_m, map_weakly)
+
+    def _kept_apart(self, mapped: MappedModels) -> list[Any]:
+        """Return the models of a large capture that are kept beside the largest one."""
+        return distinct_models(mapped.models)[1:] if self._config.is_large(len(self._names)) else []
 
     def _write_start(self, mapped: MappedModels) -> Path | None:
         """Write the largest model, for a mapping to go on from, and return its folder."""
@@ -390,8 +398,3 @@ class PoseSearch:
         """
         infos = map(self._infos.__getitem__, self._names)
         return len({(info.width_px, info.height_px) for info in infos}) == 1
-
-
-def _numbers(models: Sequence[Any]) -> set[int]:
-    """Return the indices of the photographs that models place."""
-    return {number - 1 for model in models for number in model.reg_image_ids()}

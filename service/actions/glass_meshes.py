@@ -2,6 +2,7 @@
 
 import asyncio
 import uuid
+from collections.abc import Mapping
 from weakref import WeakValueDictionary
 
 from pydantic import BaseModel
@@ -52,12 +53,18 @@ async def check_glass_meshes(
         return
     turn = _CHECKS_OF_OWNERS.setdefault(principal.owner, asyncio.Lock())
     try:
-        async with asyncio.timeout(WAIT_SECONDS), turn:
-            faults = await run_in_pool(
-                ThreadPurpose.MESHES,
-                find_open_glass, service.storage, meshes, files, service.settings.mesh_limits(),
+        async with asyncio.timeout(WAIT_SECONDS):
+            await turn.acquire()
+            check = asyncio.ensure_future(
+                run_in_pool(
+                    ThreadPurpose.MESHES,
+                    find_open_glass, service.storage, meshes, files, service.settings.mesh_limits(),
+                )
             )  # fmt: skip
-    except (TimeoutError, StorageError):
+            # Not before, as its thread goes on where nobody waits for it any more.
+            check.add_done_callback(lambda done: _end_turn(turn, done))
+            faults = await asyncio.shield(check)
+    except (OSError, StorageError):  # the limit of the time among them
         return
     errors = [
         {"pointer": f"#/options/stage/meshes/{number}/file", "detail": detail, "file": meshes[number].file}
@@ -65,3 +72,10 @@ async def check_glass_meshes(
     ]
     if errors:
         raise ProblemError(422, "stage-mesh", str(errors[0]["detail"]), errors=errors)
+
+
+def _end_turn(turn: asyncio.Lock, check: "asyncio.Future[Mapping[int, str]]") -> None:
+    """Let the next check of an owner begin; errors of one that nobody waits for any more are passed over."""
+    if not check.cancelled():
+        check.exception()
+    turn.release()

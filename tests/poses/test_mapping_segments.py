@@ -13,7 +13,7 @@ from octasplat.engine.poses import incremental_mapping, linking_pairs
 from octasplat.engine.poses.ambiguous_structure import remove_pairs
 from octasplat.engine.poses.config import PosesConfig
 from octasplat.engine.poses.features import photographs_of
-from octasplat.engine.poses.incremental_mapping import map_in_segments, map_photographs
+from octasplat.engine.poses.incremental_mapping import map_in_segments, map_photographs, take_out_unsure
 from octasplat.engine.poses.linking_pairs import match_links
 from octasplat.engine.poses.stored_mappings import (
     MAPPINGS_FOLDER,
@@ -237,6 +237,20 @@ def test_model_takes_in_another_one_that_new_matches_link(two_places: Path, tmp_
     assert counted == list(range(half + 1, PHOTOGRAPHS + 1))
 
 
+def test_photographs_that_models_share_are_counted_once(two_places: Path, tmp_path: Path) -> None:
+    models = mapped(two_places, tmp_path / "first")
+    start = tmp_path / "start"
+    start.mkdir()
+    models[0].write_binary(start)
+    counted: list[int] = []
+    (_, other) = map_in_segments(
+        two_places, StoredMapping(tmp_path / "again", MATCHES, ignore_count), seed=0, on_count=counted.append,
+        start=start, apart=models[:1],
+    )  # fmt: skip
+    assert other.num_reg_images() == PHOTOGRAPHS // 2
+    assert counted == COUNTED[PHOTOGRAPHS - 2 :]
+
+
 def test_links_of_models_are_those_that_one_geometry_explains(two_places: Path, tmp_path: Path) -> None:
     database = tmp_path / "database.db"
     shutil.copyfile(two_places, database)
@@ -270,3 +284,19 @@ def test_only_the_pairs_that_look_most_alike_are_matched_as_links(
     assert match_links(database, names, pairs, PosesConfig(), threads=1)
     with pycolmap.Database.open(database) as opened:
         assert opened.num_verified_image_pairs() == 3
+
+
+def test_photographs_that_see_few_points_are_taken_out(two_places: Path, tmp_path: Path) -> None:
+    model = mapped(two_places, tmp_path)[0]
+    first, second, third = sorted(model.reg_image_ids())[:3]
+    for number in (first, second):
+        seen = [k for k, point in enumerate(model.image(number).points2D) if point.has_point3D()]
+        for k in seen[29:]:
+            model.delete_observation(number, k)
+    assert model.image(second).num_points3D == 29 < model.image(third).num_points3D
+    take_out_unsure(model, {first})
+    assert set(model.reg_image_ids()) == set(range(1, PHOTOGRAPHS + 1)) - {second}
+    folder = tmp_path / "written"
+    folder.mkdir()
+    model.write_binary(folder)
+    assert pycolmap.Reconstruction(folder).num_reg_images() == PHOTOGRAPHS - 1

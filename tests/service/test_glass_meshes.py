@@ -184,3 +184,28 @@ async def test_meshes_of_others_are_not_read(connect_service: ConnectService) ->
                 "/v1/jobs", json=staged({**body, "files_id": files_id}, "leaf.obj"), headers=other
             )
             assert answer.status_code == 422 and answer.json()["type"].endswith(":input")
+
+
+async def test_check_that_goes_on_after_its_answer_takes_one_thread_of_its_owner(
+    connect_service: ConnectService, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, may_end = threading.Semaphore(0), threading.Event()
+    run_parser = mesh_check.run_parser
+
+    def run_late(*given: Any) -> Any:
+        begun.release()
+        assert may_end.wait(300)
+        return run_parser(*given)
+
+    monkeypatch.setattr(mesh_check, "run_parser", run_late)
+    async with connect_service() as (http, service):
+        body = staged(await render_of(http, service, {"leaf.obj": LEAF}), "leaf.obj")
+        monkeypatch.setattr(glass_meshes, "WAIT_SECONDS", 2)
+        for _ in range(2):  # neither is answered by its check, and the second one must not begin
+            made = await http.post("/v1/jobs", json=body)
+            assert made.status_code == 202, made.text
+        assert begun.acquire(timeout=60) and not begun.acquire(timeout=1)
+        monkeypatch.setattr(glass_meshes, "WAIT_SECONDS", 600)
+        asked = asyncio.create_task(http.post("/v1/jobs", json=body))
+        may_end.set()
+        assert (await asked).status_code == 422
