@@ -127,7 +127,10 @@ def estimate_scene(
     """
     from octasplat.engine.dataset.model_sources import has_model
 
-    return estimate_photographs(sizes, config.with_poses_decided(has_model(scene)), cores, blocks)
+    config, found_by = config.with_poses_decided(has_model(scene)).without_run_of_model()
+    if found_by is not None:  # a run whose poses are taken
+        config = config.model_copy(update={"poses": "given"})
+    return estimate_photographs(sizes, config, cores, blocks)
 
 
 def estimate_photographs(

@@ -12,6 +12,8 @@ import pytest
 
 from octasplat.engine.core.errors import ConfigError, DatasetError
 from octasplat.engine.core.events import Event, Warned
+from octasplat.engine.operations.estimate import estimate_scene
+from octasplat.engine.operations.photograph_sizes import photograph_sizes
 from octasplat.engine.pipeline.start_scene import keep_found_models
 from octasplat.engine.poses.found_models import (
     choose_found_model,
@@ -170,6 +172,9 @@ def test_run_takes_the_model_that_is_named(tmp_path: Path) -> None:
     assert named.with_poses_decided(True).poses == "auto"  # though the scene holds a model
     config, found_by = named.without_run_of_model()
     assert (config.model, found_by) == ("poses/1", first)
+    sizes = photograph_sizes(scene)
+    assert not estimate_scene(scene, named, sizes).finds_poses  # a run has found them
+    assert estimate_scene(scene, config, sizes).finds_poses
     for output in (other, third):
         output.mkdir()
     keep_found_models(scene, other, found_by)
