@@ -258,13 +258,14 @@ def shade_surfaces(first: int, last: int, scratch: PathScratch, bounce: Bounce) 
     for start in range(first, last, BLOCK_SIZE):
         end = min(start + BLOCK_SIZE, last)
         # --- rays that meet nothing ---
-        for k in range(start, end):
+        for row in range(start, end):
+            k = np.uintp(row)  # unsigned: no place is counted from the end of an array
             face = hits.faces[k]
             for channel in range(3):
                 shadows.radiance_linear[k, channel] = 0.0
             if face == PATH_ENDED:
                 continue
-            p = active[k]
+            p = np.uintp(active[k])
             # what lies behind a passed surface of glass is found by this path alone: it shadows light queries
             if scene.any_nested and copy_media(hits.media[k], paths.media[p]):
                 if paths.pdf[p] > 0.0:
@@ -281,8 +282,9 @@ def shade_surfaces(first: int, last: int, scratch: PathScratch, bounce: Bounce) 
             count = select_kind(scratch, kind, start, end)
             for begin in range(0, count, SHADING_ROWS):
                 stop = min(begin + SHADING_ROWS, count)
-                for i in range(begin, stop):
-                    _prefetch_face(surfaces, hits.faces[scratch.rows[i]])
+                # those of the first rows, and of the next while these are shaded
+                for i in range(stop if begin > 0 else 0, min(stop + SHADING_ROWS, count)):
+                    _prefetch_face(surfaces, hits.faces[np.uintp(scratch.rows[i])])
                 fill_samples(scratch, bounce, kind, begin, stop, asks_in_glass)
                 _write_surface_points(scratch, begin, stop, bounce)
                 if depth < integrator.max_depth:

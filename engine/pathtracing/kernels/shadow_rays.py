@@ -44,7 +44,8 @@ def _select_shadow_rays(
     Returns how many they are, and how many are of the other sort.
     """
     count = others = 0
-    for k in range(first, last):
+    for row in range(first, last):
+        k = np.uintp(row)  # unsigned: no place is counted from the end of an array
         brings = (
             shadows.radiance_linear[k, 0] + shadows.radiance_linear[k, 1] + shadows.radiance_linear[k, 2]
             > 0.0
@@ -56,7 +57,7 @@ def _select_shadow_rays(
             < 0.0
         )
         # no branch: which ray brings anything is not to be foreseen
-        rows[count] = k
+        rows[np.uintp(count)] = row
         is_wanted = shadows.passes_glass[k] == passes_glass
         count += (brings | takes) & is_wanted
         others += (brings | takes) & (not is_wanted)

@@ -27,10 +27,12 @@ from octasplat.engine.pathtracing.kernels.scatter import (
 from octasplat.engine.pathtracing.kernels.scatter_vectors import write_diffuse_ways8, write_lamp_samples8
 from octasplat.engine.pathtracing.kernels.surface import DIFFUSE, EMITTER, GLASS, MIRROR, PRINCIPLED
 from octasplat.engine.trace.cpu.kernels.simd_vector import LANES
-from octasplat.engine.trace.kernels.native import njit_no_refcount
+from octasplat.engine.trace.kernels.native import njit_no_refcount, prefetch
 
-_NOTHING = EMITTER + 1
-"""In place of a kind of material: the ray meets nothing."""
+_NOTHING = 7
+"""In place of a kind of material: the ray meets nothing. It has all bits of any kind."""
+_AHEAD = 16
+"""Rows by which the materials of faces are asked for before they are needed."""
 
 
 @njit_no_refcount(forceinline=True)
@@ -46,10 +48,13 @@ def find_kinds(
         return 0
     found = 0
     for k in range(first, last):
+        ahead = max(faces[np.uintp(min(k + _AHEAD, last - 1))], 0)
+        prefetch(material_ids.ctypes.data + material_ids.itemsize * ahead)
         # no branch: which ray meets anything is not to be foreseen
-        kind = materials.kinds[material_ids[max(faces[k], 0)]]
-        kind = kind if faces[k] >= 0 else _NOTHING
-        kinds[k - first] = kind
+        face = np.int64(faces[np.uintp(k)])
+        misses = face >> 63  # all bits set, or none
+        kind = materials.kinds[np.uintp(material_ids[np.uintp(face & ~misses)])] | (misses & _NOTHING)
+        kinds[np.uintp(k - first)] = kind
         found |= 1 << kind
     return found
 
@@ -64,8 +69,8 @@ def select_kind(scratch: PathScratch, kind: int, first: int, last: int) -> int:
     count = 0
     for k in range(first, last):
         # no branch: which kind comes next is not to be foreseen
-        rows[count] = k
-        count += kinds[k - first] == kind
+        rows[np.uintp(count)] = k
+        count += kinds[np.uintp(k - first)] == kind
     for i in range(count, count + LANES - 1):
         rows[i] = rows[count - 1]
     return count
@@ -103,7 +108,7 @@ def fill_samples(
     if depth >= integrator.max_depth:
         return
     for i in range(begin, stop):
-        p = bounce.active[scratch.rows[i]]
+        p = np.uintp(bounce.active[np.uintp(scratch.rows[i])])
         scratch.keys[i - begin], scratch.samples[i - begin] = paths.keys[p], paths.samples[p]
     first_pair = CAMERA_SAMPLE_PAIRS + depth * SAMPLE_PAIRS_PER_BOUNCE
     lights, plays_roulette = len(bounce.scene.lights.kinds), depth >= integrator.roulette_depth

@@ -83,8 +83,8 @@ def trace_paths(
             going = 0
             for k in range(left):
                 # no branch: which path ends is not to be foreseen
-                active[going] = active[k]
-                going += paths.is_alive[active[k]]
+                active[np.uintp(going)] = active[np.uintp(k)]
+                going += paths.is_alive[np.uintp(active[np.uintp(k)])]
             if len(boxes.all) > 0:
                 left, going = going, 0
                 for k in range(left):
