@@ -12,7 +12,7 @@ from octasplat.engine.pathtracing.film import Film
 from octasplat.engine.pathtracing.kernels.kernel_args import IntegratorParameters
 from octasplat.engine.pathtracing.kernels.path_args import GaussianBoxes, PathBlock, PathScratch, PathStart
 from octasplat.engine.pathtracing.kernels.trace_paths import trace_paths
-from octasplat.engine.pathtracing.path_batches import PATHS_PER_THREAD, allocate_path_block
+from octasplat.engine.pathtracing.path_batches import allocate_path_block, pixels_per_batch
 
 NO_BOXES = GaussianBoxes(np.zeros((0, 6), np.float32), np.zeros((0, 6), np.float32))
 INFINITE_T_MAX = np.full(1, np.inf, np.float32)
@@ -41,6 +41,7 @@ class MeshPaths:
         self._boxes = boxes
         self._integrator = integrator
         self._pool = pool
+        self._threads = len(scratches)
         self._free: Queue[tuple[PathScratch, PathBlock]] = Queue()
         for scratch in scratches:
             self._free.put((scratch, allocate_path_block()))
@@ -76,7 +77,7 @@ class MeshPaths:
     ) -> Bool[np.ndarray, " n"]:
         """Finish those of ``count`` pixels of which no path enters a box; return which are left."""
         enters_box = np.zeros(count, np.bool_)
-        pixels = PATHS_PER_THREAD // start.paths_per_pixel
+        pixels = pixels_per_batch(count, start.paths_per_pixel, self._threads)
         tasks = [
             self.submit(
                 film,

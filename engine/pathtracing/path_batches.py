@@ -18,7 +18,10 @@ from octasplat.engine.pathtracing.kernels.path_args import (
 )
 
 PATHS_PER_THREAD = 1 << 14
-"""Paths that a thread follows by itself among meshes alone."""
+"""Least number of paths that a thread follows by itself among meshes alone, but for what is left."""
+MOST_TOGETHER, BATCHES_PER_THREAD = 8, 4
+"""How many times as many it follows at most, as each call has its price; and how many batches each thread is
+left with at least, so that none waits long for the others."""
 
 
 class Batch(NamedTuple):
@@ -51,6 +54,15 @@ class ImageBatches:
         return PathStart(
             self.camera_rays, self.order, batch.first_pixel, batch.paths_per_pixel, batch.first_sample
         )
+
+
+def pixels_per_batch(count: int, paths_per_pixel: int, threads: int) -> int:
+    """Return how many of ``count`` pixels are traced in a batch among meshes alone.
+
+    A batch is cut at the same blocks of paths for any number of threads.
+    """
+    least = PATHS_PER_THREAD // BLOCK_SIZE * (BLOCK_SIZE // paths_per_pixel)
+    return least * min(max(count // (least * threads * BATCHES_PER_THREAD), 1), MOST_TOGETHER)
 
 
 def allocate_path_block() -> PathBlock:

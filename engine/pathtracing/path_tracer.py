@@ -48,6 +48,7 @@ from octasplat.engine.pathtracing.path_batches import (
     Batch,
     ImageBatches,
     optical_axis,
+    pixels_per_batch,
 )
 from octasplat.engine.pathtracing.stage.model import Integrator, Stage
 from octasplat.engine.render.renderer import tile_order
@@ -180,10 +181,11 @@ class PathTracer:
         )
         # neighboring pixels together: their rays form packets
         order = tile_order(image.height_px, image.width_px)
-        together = PATHS_PER_THREAD if self._scene.layers is None else PATHS_PER_WAVE
         # Always the same cut, as what is traced together may differ in the last digit.
         at_once = min(count, PATHS_PER_THREAD // MIN_TILE_PIXELS)
-        pixels = together // at_once // MIN_TILE_PIXELS * MIN_TILE_PIXELS
+        pixels = PATHS_PER_WAVE // at_once // MIN_TILE_PIXELS * MIN_TILE_PIXELS
+        if self._scene.layers is None:
+            pixels = pixels_per_batch(len(order), at_once, self._threads)
         tops = range(0, len(order), pixels)
         blocks = range(0, count, at_once)
         done, total = 0, len(tops) * len(blocks)

@@ -42,6 +42,7 @@ from octasplat.engine.pathtracing.kernels.scatter import (
     LIGHT_CHOICE_SAMPLE,
     LIGHT_POSITION_SAMPLE,
     LOBE_SAMPLE,
+    draw_light,
     scatter_path,
     survives_roulette,
 )
@@ -151,7 +152,9 @@ def intersect_gaussian_surfaces(
         shadows.medium_ids[k] = paths.medium_ids[p]
         if scene.any_nested:
             copy_media(paths.media[p], shadows.media[k])
-        scatter_path(p, samples, paths, False, SurfacePoint(point, normal, normal), bsdf, tables, query)
+        light = draw_light(lights, point, samples)
+        surface = SurfacePoint(point, normal, normal)
+        scatter_path(p, samples, paths, False, surface, bsdf, tables, light, query)
 
 
 @kernel(_nrt=False, error_model="numpy")
@@ -189,4 +192,6 @@ def start_paths_at_surfaces(
         color = float(material[0]), float(material[1]), float(material[2])
         bsdf = Bsdf(color, float(material[3]), float(material[4]), IOR, BURLEY, False, 0.0, 0.0)
         query = LightQuery(lights, integrator, shadows, k)
-        scatter_path(k, column, paths, False, SurfacePoint(origin, normal, normal), bsdf, tables, query)
+        light = draw_light(lights, origin, column)
+        surface = SurfacePoint(origin, normal, normal)
+        scatter_path(k, column, paths, False, surface, bsdf, tables, light, query)

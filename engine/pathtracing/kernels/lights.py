@@ -129,6 +129,12 @@ def light_probability(lights: LightArrays, light_id: int, p_x: float, p_y: float
     return own / total if total > 0.0 else 0.0
 
 
+@njit_no_refcount(forceinline=True)
+def is_only_rectangle(lights: LightArrays) -> bool:
+    """Return whether a rectangle that lights meshes is the only light."""
+    return len(lights.kinds) == 1 and lights.kinds[0] == RECTANGLE and lights.lights_meshes[0] != 0
+
+
 @njit_no_refcount(fastmath={"contract"})
 def no_shadow_probability(lights: LightArrays, p_x: float, p_y: float, p_z: float) -> float:
     """Return the probability with which a light is asked at p whose shadows take nothing."""

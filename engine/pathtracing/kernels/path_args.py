@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt32
 
 from octasplat.engine.pathtracing.kernels.kernel_args import IntegratorParameters, LightArrays, MeshScene
+from octasplat.engine.pathtracing.kernels.scatter_vectors import LAMP_SAMPLE_ROWS, WAY_ROWS
 from octasplat.engine.pathtracing.kernels.surface_point_vectors import SURFACE_POINT_ROWS
 from octasplat.engine.trace.cpu.kernels.simd_vector import LANES
 from octasplat.engine.trace.triangle_bvh import allocate_embree_scratch
@@ -14,8 +15,11 @@ BLOCK_SIZE = 1024
 """Rows that a thread works on at a time: few enough for the nearest cache."""
 CAMERA_SAMPLE_PAIRS = 2
 """Pairs of uniform numbers that a path uses at the camera: one for the pixel, one for the lens."""
-SHADING_ROWS = 128
+SHADING_ROWS = 64
 """Rows whose points of surfaces a thread works out at a time, before it shades them."""
+LAMP_ROW = SURFACE_POINT_ROWS
+WAY_ROW = LAMP_ROW + LAMP_SAMPLE_ROWS
+"""Rows behind those of points of surfaces: samples of the only lamp, ways on from diffuse surfaces."""
 SAMPLE_PAIRS_PER_BOUNCE = 5
 """Pairs of uniform numbers that a path uses at each surface."""
 MAX_NESTED = 4
@@ -186,7 +190,7 @@ class PathScratch(NamedTuple):
         distances: of what they met.
         faces: likewise.
         barycentrics: likewise.
-        surface_points: of some of the rows, see :mod:`.surface_point_vectors`.
+        surface_points: of some of the rows, see :mod:`.surface_point_vectors` and :mod:`.scatter_vectors`.
     """
 
     embree: Float32[np.ndarray, " w"]
@@ -202,7 +206,7 @@ class PathScratch(NamedTuple):
     distances: Float32[np.ndarray, " b"]
     faces: Int32[np.ndarray, " b"]
     barycentrics: Float32[np.ndarray, "b 2"]
-    surface_points: Float64[np.ndarray, "10 s"]
+    surface_points: Float64[np.ndarray, "22 s"]
 
 
 class CameraRays(NamedTuple):
@@ -303,13 +307,14 @@ def allocate_path_scratch(threads: int) -> list[PathScratch]:
     return [
         PathScratch(
             allocate_embree_scratch(1)[0], np.empty(BLOCK_SIZE, np.uint32), np.empty(BLOCK_SIZE, np.int32),
-            np.empty((SAMPLE_PAIRS_PER_BOUNCE - 1, 2, BLOCK_SIZE)),
+            # rows of a power of two would share one set of the cache
+            np.empty((SAMPLE_PAIRS_PER_BOUNCE - 1, 2, BLOCK_SIZE + LANES)),
             np.empty(BLOCK_SIZE + LANES, np.int32),  # the last ones may be repeated to fill a vector
             np.empty((BLOCK_SIZE, 3), np.float32), np.empty((BLOCK_SIZE, 3), np.float32),
             np.empty(BLOCK_SIZE, np.float32), np.empty(BLOCK_SIZE, np.float32),
             np.empty(BLOCK_SIZE, np.bool_),
             np.empty(BLOCK_SIZE, np.float32), np.empty(BLOCK_SIZE, np.int32),
-            np.empty((BLOCK_SIZE, 2), np.float32), np.empty((SURFACE_POINT_ROWS, SHADING_ROWS)),
+            np.empty((BLOCK_SIZE, 2), np.float32), np.empty((WAY_ROW + WAY_ROWS, SHADING_ROWS)),
         )
         for _ in range(threads)
     ]  # fmt: skip

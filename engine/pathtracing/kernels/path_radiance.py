@@ -118,7 +118,10 @@ def add_direct_light(
     transmittance: Float32[np.ndarray, "n 3"],
 ) -> None:
     """Add what shadow rays brought: ``radiance`` times the share of it that got through."""
-    for k in range(first, last):
+    for row in range(first, last):
+        k = np.uintp(row)  # unsigned: no place is counted from the end of an array
         if transmittance[k, 0] + transmittance[k, 1] + transmittance[k, 2] > 0.0:
             for channel in range(3):
-                paths.radiance_linear[active[k], channel] += radiance[k, channel] * transmittance[k, channel]
+                paths.radiance_linear[np.uintp(active[k]), channel] += (
+                    radiance[k, channel] * transmittance[k, channel]
+                )

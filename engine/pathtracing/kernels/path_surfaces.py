@@ -8,7 +8,7 @@ several threads can share the work.
 import math
 
 import numpy as np
-from jaxtyping import Int32
+from jaxtyping import Float64
 
 from octasplat.engine.core.compilation import kernel
 from octasplat.engine.pathtracing.kernels.glass import (
@@ -29,10 +29,9 @@ from octasplat.engine.pathtracing.kernels.kernel_args import (
 from octasplat.engine.pathtracing.kernels.nested_glass import copy_media
 from octasplat.engine.pathtracing.kernels.path_args import (
     BLOCK_SIZE,
-    CAMERA_SAMPLE_PAIRS,
     PATH_ENDED,
-    SAMPLE_PAIRS_PER_BOUNCE,
     SHADING_ROWS,
+    WAY_ROW,
     Bounce,
     LightQuery,
     PathArrays,
@@ -41,13 +40,12 @@ from octasplat.engine.pathtracing.kernels.path_args import (
 )
 from octasplat.engine.pathtracing.kernels.path_radiance import shade_emitter, shade_miss
 from octasplat.engine.pathtracing.kernels.rough_dielectric import MIN_GLASS_ROUGHNESS
-from octasplat.engine.pathtracing.kernels.sampler import fill_pair
 from octasplat.engine.pathtracing.kernels.scatter import (
     FLAG_CAMERA_RAY,
     FLAG_THROUGH_GLASS,
-    LIGHT_CHOICE_SAMPLE,
     LOBE_SAMPLE,
     sample_pair,
+    scatter_diffuse,
     scatter_path,
     survives_roulette,
 )
@@ -65,61 +63,19 @@ from octasplat.engine.pathtracing.kernels.surface import (
     offset_ray_origin,
 )
 from octasplat.engine.pathtracing.kernels.surface_point_vectors import write_surface_points8
+from octasplat.engine.pathtracing.kernels.surface_samples import (
+    any_rough_glass,
+    fill_samples,
+    find_kinds,
+    light_of_row,
+    select_kind,
+    write_scatter_samples,
+)
 from octasplat.engine.trace.cpu.kernels.simd_vector import LANES
 from octasplat.engine.trace.kernels.native import njit_no_refcount, prefetch
 
 _LAST_WORD = 4 * 8
 """Bytes before the last number of three corners."""
-
-
-@njit_no_refcount(forceinline=True)
-def _sort_hits(
-    scratch: PathScratch, scene: MeshScene, faces: Int32[np.ndarray, " n"], first: int, last: int
-) -> int:
-    """Write those of the rows ``first`` to ``last``, at most a block, that meet a face, by kind of material.
-
-    One kind after the other: neighbors take the same way through the code. Returns how many there are;
-    behind them the last one is repeated to fill a vector.
-    """
-    found, kinds, rows = scratch.samples, scratch.faces, scratch.rows  # the first two are free here
-    hits = 0
-    for k in range(first, last):
-        found[hits] = k
-        hits += faces[k] >= 0
-    for i in range(hits):
-        kinds[i] = scene.materials.kinds[scene.surfaces.material_ids[faces[found[i]]]]
-    count = 0
-    for kind in range(EMITTER + 1):
-        # no branch: which kind comes next is not to be foreseen
-        for i in range(hits):
-            rows[count] = found[i]
-            count += kinds[i] == kind
-    for i in range(count, count + LANES - 1):
-        rows[i] = rows[count - 1]
-    return count
-
-
-@njit_no_refcount(forceinline=True)
-def _fill_samples(
-    scratch: PathScratch,
-    paths: PathArrays,
-    active: Int32[np.ndarray, " n"],
-    count: int,
-    first_pair: int,
-    light_count: int,
-) -> None:
-    """Fill in the numbers of the ``count`` rows of :func:`_sort_hits`, in their order.
-
-    Where there is no choice of lights there are no numbers for it.
-    """
-    for i in range(count):
-        p = active[scratch.rows[i]]
-        scratch.keys[i], scratch.samples[i] = paths.keys[p], paths.samples[p]
-    for pair in range(len(scratch.random_numbers)):
-        if pair != LIGHT_CHOICE_SAMPLE or light_count > 1:
-            fill_pair(
-                scratch.keys, scratch.samples, count, first_pair + pair, scratch.random_numbers[pair]
-            )  # fmt: skip
 
 
 @njit_no_refcount(forceinline=True, fastmath={"contract"})
@@ -149,21 +105,23 @@ def _scatter_at_material(
     p: int,
     scene: MeshScene,
     face: int,
+    kind: int,
     weights: Vec3,
     is_front: bool,
     point: SurfacePoint,
     is_guide: bool,
     samples: PathSamples,
+    at: Float64[np.ndarray, "22 s"],
     query: LightQuery,
 ) -> None:
     """Scatter a path by the material of a face, with a light query where the material scatters.
 
-    ``weights`` are those of the corners; ``is_guide`` tells whether color and normal guide the denoiser.
+    ``weights`` are those of the corners; ``is_guide`` tells whether color and normal guide the denoiser;
+    ``at`` has the samples of :func:`write_scatter_samples`, in the column of the others.
     """
     surfaces, materials = scene.surfaces, scene.materials
     a, b, c = weights
     m = surfaces.material_ids[face]
-    kind = materials.kinds[m]
     # --- glass ---
     if kind == GLASS:
         glass = glass_surface(materials, m, is_front, paths.media[p])
@@ -191,6 +149,13 @@ def _scatter_at_material(
     )  # fmt: skip
     if is_guide:
         _write_denoiser_guides(paths, p, (red, green, blue), (s_x, s_y, s_z))
+    off_surface = SurfacePoint(origin, point.normal, (s_x, s_y, s_z))
+    light = light_of_row(query.lights, origin, samples, at)
+    if kind == DIFFUSE and materials.normal_textures[m] < 0:
+        n = samples.n
+        way = at[WAY_ROW, n], at[WAY_ROW + 1, n], at[WAY_ROW + 2, n]
+        scatter_diffuse(p, paths, off_surface, (red, green, blue), light, way, at[WAY_ROW + 3, n], query)
+        return
     table = materials.coat_tables[m]
     coat, coat_roughness = eval_clear_coat(materials, m, u_t, v_t)
     bsdf = Bsdf(
@@ -202,13 +167,12 @@ def _scatter_at_material(
         materials.ggx_albedo, materials.coat_albedo[table], materials.coat_mean_albedo[table],
         materials.coat_albedo[0],
     )  # fmt: skip
-    off_surface = SurfacePoint(origin, point.normal, (s_x, s_y, s_z))
-    scatter_path(p, samples, paths, kind == DIFFUSE, off_surface, bsdf, tables, query)
+    scatter_path(p, samples, paths, kind == DIFFUSE, off_surface, bsdf, tables, light, query)
 
 
 @njit_no_refcount(forceinline=True)
 def _write_surface_points(scratch: PathScratch, first: int, last: int, bounce: Bounce) -> None:
-    """Write what the shading of the rows at the places ``first`` to ``last`` of the sorted ones begins with.
+    """Write what the shading of the rows at the places ``first`` to ``last`` begins with.
 
     Nothing here depends on materials.
     """
@@ -225,8 +189,8 @@ def _write_surface_points(scratch: PathScratch, first: int, last: int, bounce: B
 
 
 @njit_no_refcount(forceinline=True, fastmath={"contract"})
-def _shade_hit(scratch: PathScratch, bounce: Bounce, k: int, n: int, place: int) -> None:
-    """Shade row ``k`` with the random numbers ``n``; its surface point is that at ``place``."""
+def _shade_hit(scratch: PathScratch, bounce: Bounce, kind: int, k: int, place: int) -> None:
+    """Shade row ``k``, of a kind of material; what was worked out for it before is that at ``place``."""
     paths, active, depth, hits, scene, integrator, shadows = bounce
     surfaces, materials, lights = scene.surfaces, scene.materials, scene.lights
     # unsigned: no place is counted from the end of an array
@@ -238,7 +202,6 @@ def _shade_hit(scratch: PathScratch, bounce: Bounce, k: int, n: int, place: int)
     b, c = float(hits.barycentrics[k, 0]), float(hits.barycentrics[k, 1])
     a = 1.0 - b - c
     m = surfaces.material_ids[face]
-    kind = materials.kinds[m]
     # Beer's law, on the way inside of glass up to this hit
     if paths.medium_ids[p] >= 0:
         medium = materials.absorption[paths.medium_ids[p]]
@@ -267,7 +230,7 @@ def _shade_hit(scratch: PathScratch, bounce: Bounce, k: int, n: int, place: int)
         paths.is_alive[p] = False
         return
     # --- the way on ---
-    samples = PathSamples(scratch.random_numbers, n)
+    samples = PathSamples(scratch.random_numbers, place)
     if depth >= integrator.roulette_depth and not survives_roulette(
         paths, p, sample_pair(samples, LOBE_SAMPLE)[1]
     ):
@@ -278,7 +241,7 @@ def _shade_hit(scratch: PathScratch, bounce: Bounce, k: int, n: int, place: int)
         copy_media(paths.media[p], shadows.media[k])
     point = SurfacePoint(position, normal, shading_normal)
     _scatter_at_material(
-        paths, p, scene, face, (a, b, c), facing >= 0.0, point, is_guide, samples, query
+        paths, p, scene, face, kind, (a, b, c), facing >= 0.0, point, is_guide, samples, at, query
     )  # fmt: skip
 
 
@@ -291,17 +254,18 @@ def shade_surfaces(first: int, last: int, scratch: PathScratch, bounce: Bounce) 
     """
     paths, active, depth, hits, scene, integrator, shadows = bounce
     surfaces, lights = scene.surfaces, scene.lights
-    first_pair = CAMERA_SAMPLE_PAIRS + depth * SAMPLE_PAIRS_PER_BOUNCE
+    asks_in_glass = any_rough_glass(scene.materials)
     for start in range(first, last, BLOCK_SIZE):
         end = min(start + BLOCK_SIZE, last)
         # --- rays that meet nothing ---
-        for k in range(start, end):
+        for row in range(start, end):
+            k = np.uintp(row)  # unsigned: no place is counted from the end of an array
             face = hits.faces[k]
             for channel in range(3):
                 shadows.radiance_linear[k, channel] = 0.0
             if face == PATH_ENDED:
                 continue
-            p = active[k]
+            p = np.uintp(active[k])
             # what lies behind a passed surface of glass is found by this path alone: it shadows light queries
             if scene.any_nested and copy_media(hits.media[k], paths.media[p]):
                 if paths.pdf[p] > 0.0:
@@ -310,13 +274,20 @@ def shade_surfaces(first: int, last: int, scratch: PathScratch, bounce: Bounce) 
             if face < 0:
                 shade_miss(paths, p, lights, scene.environment, integrator)
                 paths.is_alive[p] = False
-        # --- rays that meet a face, a kind of material after the other ---
-        count = _sort_hits(scratch, scene, hits.faces, start, end)
-        _fill_samples(scratch, paths, active, count, first_pair, len(lights.kinds))
-        for begin in range(0, count, SHADING_ROWS):
-            stop = min(begin + SHADING_ROWS, count)
-            for i in range(begin, stop):
-                _prefetch_face(surfaces, hits.faces[scratch.rows[i]])
-            _write_surface_points(scratch, begin, stop, bounce)
-            for i in range(begin, stop):
-                _shade_hit(scratch, bounce, np.uintp(scratch.rows[i]), i, i - begin)
+        # --- rays that meet a face, a kind of material after the other: neighbors take the same way ---
+        found = find_kinds(scratch, scene, hits.faces, start, end)
+        for kind in range(EMITTER + 1):
+            if found >> kind & 1 == 0:
+                continue
+            count = select_kind(scratch, kind, start, end)
+            for begin in range(0, count, SHADING_ROWS):
+                stop = min(begin + SHADING_ROWS, count)
+                # those of the first rows, and of the next while these are shaded
+                for i in range(stop if begin > 0 else 0, min(stop + SHADING_ROWS, count)):
+                    _prefetch_face(surfaces, hits.faces[np.uintp(scratch.rows[i])])
+                fill_samples(scratch, bounce, kind, begin, stop, asks_in_glass)
+                _write_surface_points(scratch, begin, stop, bounce)
+                if depth < integrator.max_depth:
+                    write_scatter_samples(scratch, lights, kind, stop - begin)
+                for i in range(begin, stop):
+                    _shade_hit(scratch, bounce, kind, np.uintp(scratch.rows[i]), i - begin)

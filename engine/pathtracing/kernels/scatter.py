@@ -166,6 +166,81 @@ def surface_eval(
 
 
 @njit_no_refcount(forceinline=True, fastmath={"contract"})
+def _is_lit(light: LightSample, point: SurfacePoint) -> bool:
+    """Return whether a sample of a light brings anything to a point, on the side of both its normals."""
+    (w_x, w_y, w_z), (red, green, blue) = light.direction, light.rgb
+    (n_x, n_y, n_z), (s_x, s_y, s_z) = point.normal, point.shading_normal
+    return (
+        w_x * s_x + w_y * s_y + w_z * s_z > 0.0
+        and w_x * n_x + w_y * n_y + w_z * n_z > 0.0
+        and red + green + blue > 0.0
+    )
+
+
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
+def _query_light(
+    p: int, paths: PathArrays, light: LightSample, origin: Vec3, value: Rgb, pdf: float, query: LightQuery
+) -> None:
+    """Queue the light of a sample; ``value`` is the surface's, times cosine, ``pdf`` its density."""
+    lights, shadows, k, l, l_pdf = query.lights, query.shadows, query.k, light.id, light.pdf
+    factor = 1.0 / light.share
+    # a light without extent is found by no other path, so that glass must let it through
+    shadows.passes_glass[k] = l_pdf == 0.0
+    if l_pdf > 0.0:
+        l_pdf *= light.share
+        # balance heuristic, where both ways can find the light
+        factor = 1.0 / (l_pdf + pdf) if lights.is_hittable[l] else 1.0 / l_pdf
+    # nothing is in the way of what casts no shadows
+    distance = light.distance if lights.casts_shadows[l] else 0.0
+    w, (f_r, f_g, f_b), (l_r, l_g, l_b) = paths.throughput[p], value, light.rgb
+    radiance = w[0] * f_r * l_r * factor, w[1] * f_g * l_g * factor, w[2] * f_b * l_b * factor
+    clamp = query.integrator.clamp if paths.flags[p] & FLAG_SCATTERED else np.inf
+    queue_shadow_ray(shadows, k, origin, light.direction, distance, radiance, clamp)
+
+
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
+def _leave_surface(
+    p: int, paths: PathArrays, point: SurfacePoint, direction: Vec3, factor: Rgb, pdf: float
+) -> bool:
+    """Multiply the throughput of a path that goes on by ``factor``; return whether it goes on at all."""
+    (w_x, w_y, w_z), (n_x, n_y, n_z), (red, green, blue) = direction, point.normal, factor
+    if not pdf > 0.0 or w_x * n_x + w_y * n_y + w_z * n_z <= 0.0 or red + green + blue <= 0.0:
+        paths.is_alive[p] = False
+        return False
+    paths.throughput[p, 0] *= red
+    paths.throughput[p, 1] *= green
+    paths.throughput[p, 2] *= blue
+    paths.flags[p] = (paths.flags[p] | FLAG_SCATTERED) & ~(FLAG_CLEAR | FLAG_CAMERA_RAY | FLAG_THROUGH_GLASS)
+    return True
+
+
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
+def scatter_diffuse(
+    p: int,
+    paths: PathArrays,
+    point: SurfacePoint,
+    rgb: Rgb,
+    light: LightSample,
+    way: Vec3,
+    pdf: float,
+    query: LightQuery,
+) -> None:
+    """Queue a light query at a diffuse surface, and continue path ``p`` from a point off it.
+
+    Its ``way`` on, with the density ``pdf``, was drawn before, as was the light's sample.
+    """
+    if _is_lit(light, point):
+        (w_x, w_y, w_z), (s_x, s_y, s_z) = light.direction, point.shading_normal
+        share = (w_x * s_x + w_y * s_y + w_z * s_z) / math.pi
+        value = rgb[0] * share, rgb[1] * share, rgb[2] * share
+        _query_light(p, paths, light, point.position, value, share, query)
+    # as dense as the value: the color is what is left
+    if _leave_surface(p, paths, point, way, rgb, pdf):
+        (x, y, z), (w_x, w_y, w_z) = point.position, way
+        spawn_ray(paths, p, x, y, z, w_x, w_y, w_z, pdf)
+
+
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
 def scatter_path(
     p: int,
     samples: PathSamples,
@@ -174,14 +249,14 @@ def scatter_path(
     point: SurfacePoint,
     bsdf: Bsdf,
     tables: AlbedoTables,
+    light: LightSample,
     query: LightQuery,
 ) -> None:
-    """Queue a light query, and continue path ``p`` from a point off its surface.
+    """Queue a query of the light that was drawn, and continue path ``p`` from a point off its surface.
 
     A surface that ``is_diffuse`` has a color alone.
     """
-    (x, y, z), (n_x, n_y, n_z), (s_x, s_y, s_z) = point
-    lights, shadows, k = query.lights, query.shadows, query.k
+    (x, y, z), _, (s_x, s_y, s_z) = point
     d = paths.directions_world[p]
     # --- the direction to the viewer, in the frame of the shading normal ---
     a_x, a_y, a_z, b_x, b_y, b_z = orthonormal_basis(s_x, s_y, s_z)
@@ -190,25 +265,16 @@ def scatter_path(
         -(d[0] * b_x + d[1] * b_y + d[2] * b_z),
         -(d[0] * s_x + d[1] * s_y + d[2] * s_z),
     )
-    # --- a sample of a light ---
-    l, share, (w_x, w_y, w_z), distance, (l_r, l_g, l_b), l_pdf = draw_light(lights, point.position, samples)
-    i_z = w_x * s_x + w_y * s_y + w_z * s_z
-    if i_z > 0.0 and w_x * n_x + w_y * n_y + w_z * n_z > 0.0 and l_r + l_g + l_b > 0.0:
-        i = w_x * a_x + w_y * a_y + w_z * a_z, w_x * b_x + w_y * b_y + w_z * b_z, i_z
+    # --- the sample of a light ---
+    if _is_lit(light, point):
+        w_x, w_y, w_z = light.direction
+        i = (
+            w_x * a_x + w_y * a_y + w_z * a_z,
+            w_x * b_x + w_y * b_y + w_z * b_z,
+            w_x * s_x + w_y * s_y + w_z * s_z,
+        )
         f_r, f_g, f_b, pdf = surface_eval(o, i, is_diffuse, bsdf, tables)
-        factor = 1.0 / share
-        # a light without extent is found by no other path, so that glass must let it through
-        shadows.passes_glass[k] = l_pdf == 0.0
-        if l_pdf > 0.0:
-            l_pdf *= share
-            # balance heuristic, where both ways can find the light
-            factor = 1.0 / (l_pdf + pdf) if lights.is_hittable[l] else 1.0 / l_pdf
-        # nothing is in the way of what casts no shadows
-        distance = distance if lights.casts_shadows[l] else 0.0
-        w = paths.throughput[p]
-        radiance = w[0] * f_r * l_r * factor, w[1] * f_g * l_g * factor, w[2] * f_b * l_b * factor
-        clamp = query.integrator.clamp if paths.flags[p] & FLAG_SCATTERED else np.inf
-        queue_shadow_ray(shadows, k, point.position, (w_x, w_y, w_z), distance, radiance, clamp)
+        _query_light(p, paths, light, point.position, (f_r, f_g, f_b), pdf, query)
     # --- a sample of the BSDF ---
     u, v = sample_pair(samples, DIRECTION_SAMPLE)
     if is_diffuse:
@@ -223,14 +289,8 @@ def scatter_path(
     w_x = i_x * a_x + i_y * b_x + i_z * s_x
     w_y = i_x * a_y + i_y * b_y + i_z * s_y
     w_z = i_x * a_z + i_y * b_z + i_z * s_z
-    if not pdf > 0.0 or w_x * n_x + w_y * n_y + w_z * n_z <= 0.0 or f_r + f_g + f_b <= 0.0:
-        paths.is_alive[p] = False
-        return
     # --- the path goes on ---
-    paths.throughput[p, 0] *= f_r
-    paths.throughput[p, 1] *= f_g
-    paths.throughput[p, 2] *= f_b
-    paths.flags[p] = (paths.flags[p] | FLAG_SCATTERED) & ~(FLAG_CLEAR | FLAG_CAMERA_RAY | FLAG_THROUGH_GLASS)
-    if not is_diffuse:
-        w_x, w_y, w_z = normalize(w_x, w_y, w_z)
-    spawn_ray(paths, p, x, y, z, w_x, w_y, w_z, pdf)
+    if _leave_surface(p, paths, point, (w_x, w_y, w_z), (f_r, f_g, f_b), pdf):
+        if not is_diffuse:
+            w_x, w_y, w_z = normalize(w_x, w_y, w_z)
+        spawn_ray(paths, p, x, y, z, w_x, w_y, w_z, pdf)

@@ -44,7 +44,8 @@ def _select_shadow_rays(
     Returns how many they are, and how many are of the other sort.
     """
     count = others = 0
-    for k in range(first, last):
+    for row in range(first, last):
+        k = np.uintp(row)  # unsigned: no place is counted from the end of an array
         brings = (
             shadows.radiance_linear[k, 0] + shadows.radiance_linear[k, 1] + shadows.radiance_linear[k, 2]
             > 0.0
@@ -55,11 +56,11 @@ def _select_shadow_rays(
             + shadows.occluded_radiance_linear[k, 2]
             < 0.0
         )
-        if brings or takes:
-            rows[count] = k
-            is_wanted = shadows.passes_glass[k] == passes_glass
-            count += is_wanted
-            others += not is_wanted
+        # no branch: which ray brings anything is not to be foreseen
+        rows[np.uintp(count)] = row
+        is_wanted = shadows.passes_glass[k] == passes_glass
+        count += (brings | takes) & is_wanted
+        others += (brings | takes) & (not is_wanted)
     return count, others
 
 
@@ -81,10 +82,9 @@ def _trace_occlusion(
     for i in range(count):
         k = scratch.rows[i]
         free = not scratch.is_occluded[i]
-        transmittance[k, 0] = transmittance[k, 1] = transmittance[k, 2] = 1.0 if free else 0.0
-        if free:
-            scratch.rows[left] = k
-            left += 1
+        transmittance[k, 0] = transmittance[k, 1] = transmittance[k, 2] = np.float32(free)
+        scratch.rows[left] = k
+        left += free
     return left
 
 

@@ -10,7 +10,6 @@ from octasplat.engine.pathtracing.kernels.cutouts import pass_surfaces
 from octasplat.engine.pathtracing.kernels.film import FilmArrays, add_paths
 from octasplat.engine.pathtracing.kernels.kernel_args import IntegratorParameters, MeshQueries, MeshScene
 from octasplat.engine.pathtracing.kernels.path_args import (
-    BLOCK_SIZE,
     Bounce,
     GaussianBoxes,
     PathBlock,
@@ -47,7 +46,7 @@ def trace_paths(
     """
     paths, active, hits, shadows, transmittance = block
     each = start.paths_per_pixel
-    together = BLOCK_SIZE // each
+    together = len(active) // each
     for begin in range(0, count, together):
         pixels = min(together, count - begin)
         left = pixels * each
@@ -83,9 +82,14 @@ def trace_paths(
             # --- the paths that go on ---
             going = 0
             for k in range(left):
-                if paths.is_alive[active[k]] and not enters[active[k] // each]:
+                # no branch: which path ends is not to be foreseen
+                active[np.uintp(going)] = active[np.uintp(k)]
+                going += paths.is_alive[np.uintp(active[np.uintp(k)])]
+            if len(boxes.all) > 0:
+                left, going = going, 0
+                for k in range(left):
                     active[going] = active[k]
-                    going += 1
+                    going += not enters[active[k] // each]
             left = going
             if left == 0:
                 break
