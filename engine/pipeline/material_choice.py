@@ -1,4 +1,4 @@
-"""The recipe by which a run learns materials: chosen by short trainings before a long one."""
+"""Whether a run learns materials, and by which recipe: chosen by short trainings before a long one."""
 
 import json
 from pathlib import Path
@@ -15,25 +15,35 @@ from octasplat.engine.train.config import iteration_count
 from octasplat.engine.train.loop.trial_training import MATERIAL_TRIAL_RAYS, material_gain_db
 from octasplat.engine.train.sampling.pixel_sampler import valid_pixel_fraction
 
-MaterialChoice = Literal["split_sum", "near_field"]
-"""Recipes that are chosen between: materials in far light, or mirrors of what stands near."""
+MaterialChoice = Literal["split_sum", "near_field", "none"]
+"""What is chosen between: materials in far light, mirrors of what stands near, or no materials."""
 CHOICE_KEY = "material_choice"
 """Of ``config.json``, where a run has chosen."""
 LONG_TRAINING_TRIALS = 8
 """Trainings of less than so many times the rays of a trial are begun without one."""
 MAX_MATERIAL_LOSS_DB = 1.0
-"""Loss of a trial above which ``near_field`` is tried, and chosen if it loses nothing."""
+"""Loss of a trial above which ``near_field`` is tried, and chosen if it loses nothing, for a thing that masks
+or alpha cut out. What is polished may gain in the end what it loses in a trial."""
+MAX_WHOLE_LOSS_DB = 0.3
+"""The same for whole photographs, whose surroundings are not far away. They are trained without materials if
+``near_field`` loses, too."""
 
 
 def apply_choice(config: ReconstructionConfig, choice: MaterialChoice) -> ReconstructionConfig:
-    """Return the settings of a run that asked for materials, with the recipe that was chosen.
+    """Return the settings of a run that asked for materials, with what was chosen.
 
     Example:
         >>> from octasplat.engine.runs.config import resolve_config
         >>> apply_choice(resolve_config("fast", materials=True), "near_field").train.materials.recipe
         'near_field'
+        >>> apply_choice(resolve_config("fast", materials=True), "none") == resolve_config("fast")
+        True
     """
-    return revise_config(config.model_dump(mode="json"), train={"materials": {"recipe": choice}})
+    before = config.model_dump(mode="json")
+    if choice != "none":
+        return revise_config(before, train={"materials": {"recipe": choice}})
+    # edges are a term of materials alone, which would be refused
+    return revise_config(before, materials=False, train={"loss": {"edges": None}})
 
 
 def with_recorded_choice(output: Path, config: ReconstructionConfig) -> ReconstructionConfig:
@@ -76,7 +86,8 @@ def choose_materials(run: ReconstructionRun) -> None:
     run.progress(Noted("Two short trainings show first whether materials explain these photographs."))
     gain_db = _trial_gain_db(run, config.materials.recipe)
     is_chosen = _asks_for_choice(run.config) and not has_start(run.output)
-    if gain_db >= -MAX_MATERIAL_LOSS_DB:
+    is_whole = not (run.dataset.has_alpha or run.dataset.has_masks)
+    if gain_db >= -(MAX_WHOLE_LOSS_DB if is_whole and is_chosen else MAX_MATERIAL_LOSS_DB):
         if is_chosen:
             _record(run, "split_sum")
         return
@@ -93,6 +104,16 @@ def choose_materials(run: ReconstructionRun) -> None:
                 )
             )
             _record(run, "near_field")
+            return
+        if is_whole:
+            run.progress(
+                Warned(
+                    f"{loss}: little here reflects its surroundings clearly. The scene is trained without "
+                    "materials; --set materials.fallback=false learns them all the same, for a scene that is "
+                    "to be lit anew."
+                )
+            )
+            _record(run, "none")
             return
         _record(run, "split_sum")
     advice = (

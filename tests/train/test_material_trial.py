@@ -5,6 +5,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from octasplat.engine.core.errors import ConfigError
@@ -12,6 +13,7 @@ from octasplat.engine.core.events import Event, Noted, Warned
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
 from octasplat.engine.pipeline import material_choice, reconstruct, train_step
+from octasplat.engine.render.image_files import write_png
 from octasplat.engine.runs.config import read_config, resolve_config
 from octasplat.engine.train.loop import trial_training
 from octasplat.engine.train.loop.time_budget import TimeBudgetPlan, make_plan
@@ -69,29 +71,54 @@ def run_few(scene: Path, output: Path, *more: str, resume: bool = False) -> tupl
 
 
 def learnt(output: Path) -> str:
-    """Return the recipe by which a run has learnt materials."""
-    return read_config(output / "config.json").train.materials.recipe
+    """Return the recipe by which a run has learnt materials; none if it has not."""
+    materials = read_config(output / "config.json").train.materials
+    return materials.recipe if materials.learn else "none"
 
 
 @pytest.mark.parametrize(
-    ("far_db", "near_db", "expected", "sentence"),
+    ("is_thing", "far_db", "near_db", "expected", "sentence"),
     [
-        (-7.0, 1.5, "near_field", "1.5 dB better with materials.recipe=near_field"),
-        pytest.param(-1.5, -0.1, "split_sum", "Leave out --materials", marks=pytest.mark.exhaustive),
-        pytest.param(0.5, 9.0, "split_sum", "", marks=pytest.mark.exhaustive),
+        (False, -7.0, 1.5, "near_field", "1.5 dB better with materials.recipe=near_field"),
+        (False, -0.4, -0.1, "none", "trained without materials"),
+        pytest.param(False, -0.2, 9.0, "split_sum", None, marks=pytest.mark.exhaustive),
+        pytest.param(True, -1.5, -0.1, "split_sum", "Leave out --materials", marks=pytest.mark.exhaustive),
+        pytest.param(True, -0.9, 9.0, "split_sum", None, marks=pytest.mark.exhaustive),
+        pytest.param(True, -1.5, 0.1, "near_field", "0.1 dB better", marks=pytest.mark.exhaustive),
     ],
 )  # fmt: skip
 def test_long_training_learns_what_explains_the_photographs(
-    few_pixels: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, far_db, near_db, expected, sentence
-) -> None:
+    few_pixels: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    is_thing: bool, far_db: float, near_db: float, expected: str, sentence: str | None,
+) -> None:  # fmt: skip
     tried = gains(monkeypatch, far_db, near_db)
-    warned, noted = run_few(few_pixels, tmp_path / "run")
+    scene = few_pixels
+    if is_thing:
+        scene = tmp_path / "thing"
+        shutil.copytree(few_pixels, scene)
+        (scene / "masks").mkdir()
+        for photograph in (scene / "images").iterdir():
+            write_png(scene / "masks" / f"{photograph.name}.png", np.ones((18, 24, 3), np.float32))
+    warned, noted = run_few(scene, tmp_path / "run")
     assert any(TRIALS in message for message in noted)
     assert learnt(tmp_path / "run") == expected
-    assert "metallic" in read_gaussian_ply(tmp_path / "run" / "scene.ply")[0].channels
+    channels = read_gaussian_ply(tmp_path / "run" / "scene.ply")[0].channels
+    assert ("metallic" in channels) == (expected != "none")
     loss = f"{-far_db:.1f} dB worse with materials than without"
-    assert sum(loss in message and sentence in message for message in warned) == (far_db < -1)
-    assert tried == (["split_sum", "near_field"] if far_db < -1 else ["split_sum"])
+    told = [message for message in warned if loss in message]
+    assert len(told) == (sentence is not None) and (sentence is None or sentence in told[0])
+    assert tried == (["split_sum"] if sentence is None else ["split_sum", "near_field"])
+
+
+def test_scene_that_materials_do_not_explain_is_as_without_them(
+    few_pixels: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gains(monkeypatch, -2.0, -1.0)
+    run_few(few_pixels, tmp_path / "run")
+    config = resolve_config("fast", settings={"exports": ()}, assignments=FEW)
+    reconstruct(few_pixels, tmp_path / "plain", config, threads=1)
+    scene, plain = ((tmp_path / name / "scene.ply").read_bytes() for name in ("run", "plain"))
+    assert scene == plain
 
 
 @pytest.mark.exhaustive
