@@ -86,7 +86,7 @@ def test_one_worker_makes_the_bytes_of_one_process(
     assert [child.attempt for child in blocks(bench, root)] == [1, 1] and bench.job(root).attempt == 2
     # The coarse scene was shown, and then what each block had learnt.
     shown = [event.data["step"] for event in bench.events(root) if event.kind == "live_scene"]
-    assert shown[-3:] == [15, 15 + 30, 15 + 2 * 30]
+    assert shown[-3:] == [15, 15 + 15, 15 + 2 * 15]
 
 
 @pytest.mark.exhaustive
