@@ -44,7 +44,7 @@ pytestmark = pytest.mark.heavy
 
 REQUESTED = {
     "train": {
-        **{"iterations": 30, "rays_per_batch": 512, "sh_degree": 1, "max_gaussians": 600},
+        **{"iterations": 60, "rays_per_batch": 512, "sh_degree": 1, "max_gaussians": 600},
         **{"initial_points": 300, "probe_rays": 256, "checkpoint_every": 10},
         **{"background": "learnt", "exposure": "auto"},
     },
@@ -137,13 +137,13 @@ def test_programs_hand_over_what_makes_the_bytes_of_one_process(scene: Path, tmp
     assert views_there(photographs, "images") == set(range(16))
     events, _ = run_task(run_whole, first, options, photographs)
     (planned,) = [event for event in events if isinstance(event, BlocksPlanned)]
-    assert planned.numbers == (1, 2) and planned.first_iterations == 15
-    assert planned.total_iterations == 15 + 2 * 30 + 20
+    assert planned.numbers == (1, 2) and planned.first_iterations == 30
+    assert planned.total_iterations == 30 + 2 * 30 + 100
     assert not (first.folder / "results").exists()
     # The points are shown first, and then the coarse scene.
     shown_scenes = [event for event in events if isinstance(event, LiveSceneWritten)]
     coarse = load_best(first.folder / "run" / "blocks" / "coarse").gaussians
-    assert [event.step for event in shown_scenes] == [0, 15] and shown_scenes[1].gaussians == len(coarse)
+    assert [event.step for event in shown_scenes] == [0, 30] and shown_scenes[1].gaussians == len(coarse)
     live = read_gaussian_ply(first.folder / "run" / shown_scenes[1].path)[0]
     cores = [block.core for block in load_plan(first.folder / "run" / "blocks").blocks]
     places = [coarse.means_world[core.contains(coarse.means_world)] for core in cores]
@@ -151,7 +151,7 @@ def test_programs_hand_over_what_makes_the_bytes_of_one_process(scene: Path, tmp
     assert min(map(len, places)) > 0 and np.array_equal(live.means_world, np.concatenate(places))
     cameras = json.loads((first.folder / "run" / shown_scenes[1].views).read_text())["views"]
     assert [camera["held_out"] for camera in cameras] == [view % 4 == 0 for view in range(16)]
-    checkpoint = first.store_checkpoint("train", 15)
+    checkpoint = first.store_checkpoint("train", 30)
     assert checkpoint is not None
     names = {file.path.removeprefix("run/") for file in checkpoint.files}
     pieces = {"request.json", "plan.npz", "photographs.json", "coarse/best.npz", "coarse/piece.json"}
@@ -199,7 +199,7 @@ def test_programs_hand_over_what_makes_the_bytes_of_one_process(scene: Path, tmp
     events, _ = run_task(run_whole, last, options, photographs)
     assert not any(isinstance(event, BlocksPlanned | LiveSceneWritten) for event in events)
     steps = [event.iteration for event in events if isinstance(event, CheckpointWritten)]
-    assert steps and min(steps) >= 15 + 2 * 30  # they count what was before
+    assert steps and min(steps) >= 30 + 2 * 30  # they count what was before
     for name in ("scene.ply", "mesh.ply", "background.exr", "views.json", "held_out.json"):
         assert (last.folder / "results" / name).read_bytes() == (whole / name).read_bytes(), name
     record = json.loads((last.folder / "results" / "training.json").read_text())
