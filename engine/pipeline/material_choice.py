@@ -109,8 +109,9 @@ def choose_materials(run: ReconstructionRun) -> None:
             run.progress(
                 Warned(
                     f"{loss}: little here reflects its surroundings clearly. The scene is trained without "
-                    "materials; --set materials.fallback=false learns them all the same, for a scene that is "
-                    "to be lit anew."
+                    "materials, with the settings of its preset for that where none was given that differs "
+                    "from those with materials; --set materials.fallback=false learns them all the same, for "
+                    "a scene that is to be lit anew."
                 )
             )
             _record(run, "none")
