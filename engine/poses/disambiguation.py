@@ -19,7 +19,7 @@ from octasplat.engine.poses.gps_contradictions import (
     gps_error_m,
 )
 from octasplat.engine.poses.incremental_mapping import best_rank
-from octasplat.engine.poses.model_selection import distinct_models
+from octasplat.engine.poses.model_selection import distinct_models, photograph_indices
 from octasplat.engine.poses.whole_files import copy_database
 
 MapPhotographs = Callable[[Path], list[Any]]
@@ -54,7 +54,7 @@ class MappedModels:
         In a large capture, and where they were unfolded, those of all models count that are kept.
         """
         if self.left_out_pairs or photographs >= SEPARATE_PARTS_FROM:
-            return len(_placed(self.models))
+            return len(photograph_indices(distinct_models(self.models)))
         return best_rank(self.models)[0]
 
 
@@ -152,7 +152,8 @@ def leave_out_pairs_against_gps(
         again = map_again(trial)
         again_m = gps_error_m(again, found.folded, ground_m)
         agrees_better = again_m <= MAX_ERROR_SHARE_OF_BETTER * error_m and (
-            len(_placed(again)) >= MIN_PLACED_SHARE * len(_placed(mapped.models))
+            len(photograph_indices(distinct_models(again)))
+            >= MIN_PLACED_SHARE * len(photograph_indices(distinct_models(mapped.models)))
         )
         if not agrees_better and not (
             again_m < error_m and _explains_more(again, trial, mapped.models, database)
@@ -220,8 +221,3 @@ def _explains_more(again: Sequence[Any], trial: Path, models: Sequence[Any], dat
     ]
     # fewer matches explained: the cut was no fold
     return bool(inliers[0] > inliers[1])
-
-
-def _placed(models: Sequence[Any]) -> set[int]:
-    """Return the numbers of the photographs in the models that are kept."""
-    return {number for model in distinct_models(models) for number in model.reg_image_ids()}

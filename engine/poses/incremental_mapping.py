@@ -4,13 +4,14 @@ Bundle adjustment adds up in the order in which its threads come, so more of the
 now and then other photographs; most of the mapper runs on one thread anyway.
 """
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Sequence, Set
 from pathlib import Path
 from typing import Any
 
 import pycolmap
 
 from octasplat.engine.core.scene_layout import MIN_PHOTOGRAPHS
+from octasplat.engine.poses.model_selection import photograph_indices
 from octasplat.engine.poses.stored_mappings import StoredMapping
 
 OnCount = Callable[[int], None]
@@ -114,7 +115,7 @@ def map_in_segments(
     while not stored.state.is_done:
         _map_segment(options, database, stored, start, apart, count)
     models = stored.models()
-    count.tell(len(_placed([*apart, *models])))
+    count.tell(len(photograph_indices([*apart, *models])))
     return sorted(models, key=model_rank, reverse=True)
 
 
@@ -133,7 +134,7 @@ def _map_segment(
     finished = [*apart, *stored.models()]
     options.image_names = _names_left(database, finished, _all_models(manager))
     is_segment_end = _run_mapper(
-        options, database, manager, count, ends_segments=True, finished=_placed(finished)
+        options, database, manager, count, ends_segments=True, finished=photograph_indices(finished)
     )
     models = _all_models(manager)
     if is_segment_end:
@@ -167,7 +168,7 @@ def _run_mapper(
     count: "_Count",
     *,
     ends_segments: bool = False,
-    finished: frozenset[int] = frozenset(),
+    finished: Set[int] = frozenset(),
 ) -> bool:
     """Run COLMAP's mapper, with a model in ``manager`` to go on from or without; return where it ends.
 
@@ -178,7 +179,7 @@ def _run_mapper(
         count: counts the photographs.
         ends_segments: stop after an adjustment of all photographs of a model that has grown by
             :data:`_SEGMENT_GROWTH`.
-        finished: numbers of the photographs of models that are complete; of segments, all models count.
+        finished: indices of the photographs of models that are complete; of segments, all models count.
 
     Returns:
         Whether that was the end of a segment; the last model is not complete then.
@@ -193,7 +194,7 @@ def _run_mapper(
     def placed() -> int:
         models = _all_models(manager)
         # models share photographs
-        return len(finished | _placed(models)) if ends_segments else models[-1].num_reg_images()
+        return len(finished | photograph_indices(models)) if ends_segments else models[-1].num_reg_images()
 
     count.begin(placed() if begun else len(finished))
 
@@ -236,10 +237,10 @@ def take_out_unsure(model: Any, sure: Collection[int]) -> None:
 
     Args:
         model: a ``pycolmap.Reconstruction``, which is changed.
-        sure: numbers of the photographs that stay in any case.
+        sure: indices, from 0, of the photographs that stay in any case.
     """
-    for number in sorted(set(model.reg_image_ids()) - set(sure)):
-        image = model.image(number)
+    for index in sorted(photograph_indices([model]) - set(sure)):
+        image = model.image(index + 1)
         if image.num_points3D < _MIN_SEEN_POINTS:
             model.deregister_frame(image.frame_id)
 
@@ -282,11 +283,6 @@ def _all_models(manager: Any) -> list[Any]:
     return [manager.get(k) for k in range(manager.size())]
 
 
-def _placed(models: Sequence[Any]) -> frozenset[int]:
-    """Return the numbers of the photographs of models, which may share some."""
-    return frozenset(number for model in models for number in model.reg_image_ids())
-
-
 def _names_left(database: Path, finished: Sequence[Any], current: Sequence[Any]) -> list[str]:
     """Return the names of the photographs that no finished model has, and of those of the current one.
 
@@ -296,8 +292,8 @@ def _names_left(database: Path, finished: Sequence[Any], current: Sequence[Any])
         return []
     with pycolmap.Database.open(database) as source:
         names = {image.image_id: image.name for image in source.read_all_images()}
-    placed, kept = _placed(finished), _placed(current)
-    return sorted(name for number, name in names.items() if number not in placed or number in kept)
+    placed, kept = photograph_indices(finished), photograph_indices(current)
+    return sorted(name for number, name in names.items() if number - 1 not in placed or number - 1 in kept)
 
 
 def model_rank(model: Any) -> tuple[int, int]:

@@ -129,8 +129,8 @@ class PoseSearch:
         if placed < count and (count <= config.exhaustive_up_to or placed < RETRY_BELOW_SHARE * count):
             self._progress(
                 Warned(
-                    f"{placed} of {count} photographs could be placed at first; they are searched again "
-                    "with more features."
+                    f"{placed} of {count} photographs could be placed at first; they are searched again with "
+                    "more features."
                 )
             )
             # max keeps the first of equals: the usual search
@@ -283,7 +283,7 @@ class PoseSearch:
         def map_weakly(copy: Path) -> list[Any]:
             models = self._map(copy, at, allow_weak_links=True, start=start, apart=apart)
             for model in models if config.is_large(count) else []:
-                take_out_unsure(model, {k + 1 for k in posed})
+                take_out_unsure(model, posed)
             return sorted([*models, *apart], key=model_rank, reverse=True)
 
         return register_without_pairs_against_gps(mapped, database, ground_m, map_weakly)

@@ -7,7 +7,12 @@ from octasplat.engine.core.events import EventListener, Warned
 from octasplat.engine.core.scene_layout import MIN_PHOTOGRAPHS
 from octasplat.engine.poses.disambiguation import MappedModels, describe_gps_contradictions
 from octasplat.engine.poses.incremental_mapping import best_rank, model_rank
-from octasplat.engine.poses.model_selection import describe_parts, distinct_models, is_trustworthy
+from octasplat.engine.poses.model_selection import (
+    describe_parts,
+    distinct_models,
+    is_trustworthy,
+    photograph_indices,
+)
 
 
 def search_rank(mapped: MappedModels, photographs: int, min_share: float) -> tuple[bool, int, int]:
@@ -55,7 +60,5 @@ def check_mapped(
         )
     for sentence in describe_gps_contradictions(mapped):
         progress(Warned(sentence))
-    placed = {number for model in distinct_models(models) for number in model.reg_image_ids()}
-    if len(placed) < count:
-        left = count - len(placed)
+    if left := count - len(photograph_indices(distinct_models(models))):
         progress(Warned(f"{left} of {count} photographs could not be placed and are left out."))
