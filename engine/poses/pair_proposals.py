@@ -5,27 +5,22 @@ By GPS where the photographs have it, else by a vocabulary of the capture's own 
 2016, describes its index); neighbors by name always. The quick look decides.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float32, Float64
+from jaxtyping import Float64
 
 from octasplat.engine.poses.config import PROPOSALS_PER_PHOTOGRAPH
 from octasplat.engine.poses.pairs import Pair, neighbor_pairs
+from octasplat.engine.poses.vocabulary import alike_by_vocabulary
 
 NEIGHBORS_BY_NAME = 10
 MIN_GPS_SHARE = 0.9
 """Share of the photographs that must have GPS for it to propose alone."""
 MAX_DISTANCE_M = 1e6
 """Only the number of the nearest counts."""
-TRAINING_DESCRIPTORS = 100_000
-"""Features that the vocabulary is learnt from, drawn at random."""
-MAX_WORDS = 4096
-DESCRIPTORS_PER_WORD = 8
-CLUSTERING_ITERATIONS = 10
-_EMBEDDING_BITS = 64
 
 
 def propose_pairs(database: Path, small: Path, count: int, *, seed: int, threads: int) -> list[Pair]:
@@ -76,65 +71,6 @@ def _nearest_by_gps(photographs: "pycolmap.Database", threads: int) -> set[Pair]
     options.max_distance = MAX_DISTANCE_M
     options.num_threads = threads
     return _as_pairs(pycolmap.SpatialPairGenerator(options, photographs).all_pairs())
-
-
-def alike_by_vocabulary(
-    small: Path, count: int, queries: Sequence[int], most: int, *, seed: int
-) -> Iterator[tuple[int, list[int]]]:
-    """Yield photographs by their numbers, each with those that are most alike by a vocabulary, in order.
-
-    Args:
-        small: database of the photographs with their largest features only.
-        count: photographs in all.
-        queries: numbers of those to yield.
-        most: photographs for each of them.
-        seed: of the vocabulary.
-    """
-    index_file = small.with_name("vocabulary.bin")
-    with pycolmap.Database.open(small) as photographs:
-        descriptors = _drawn_descriptors(photographs, count, seed)
-        if len(descriptors) < 2 * DESCRIPTORS_PER_WORD:
-            return
-        words = min(MAX_WORDS, len(descriptors) // DESCRIPTORS_PER_WORD)
-        options = pycolmap.VisualIndex.BuildOptions()
-        options.num_visual_words = words
-        options.num_iterations = CLUSTERING_ITERATIONS
-        options.num_rounds = 1
-        options.num_threads = 1  # sums are the same on any number of threads then, and so are votes below
-        features = pycolmap.FeatureDescriptorsFloat()
-        features.type = pycolmap.FeatureExtractorType.SIFT
-        features.data = descriptors
-        pycolmap.set_random_seed(seed)
-        index = pycolmap.VisualIndex.create(descriptors.shape[1], _EMBEDDING_BITS)
-        index.build(options, features)
-        index_file.unlink(missing_ok=True)
-        index.write(index_file)
-        pairing = pycolmap.VocabTreePairingOptions()
-        pairing.vocab_tree_path = index_file
-        pairing.num_images = most
-        pairing.num_threads = 1
-        generator = pycolmap.VocabTreePairGenerator(pairing, photographs, list(queries))
-        while not generator.has_finished():
-            # pairs of one photograph with those that it asks for, the most alike first
-            pairs = [pair for pair in generator.next() if pair[0] != pair[1]]
-            if pairs:
-                yield pairs[0][0], [other for _, other in pairs]
-    index_file.unlink()
-
-
-def _drawn_descriptors(
-    photographs: "pycolmap.Database", count: int, seed: int
-) -> Float32[np.ndarray, "d 128"]:
-    """Return features drawn evenly from all photographs."""
-    rng = np.random.Generator(np.random.PCG64(seed))
-    each = max(1, TRAINING_DESCRIPTORS // count)
-    drawn = [np.zeros((0, 128), np.float32)]
-    for number in range(1, count + 1):
-        if photographs.exists_descriptors(number):
-            data = photographs.read_descriptors(number).data
-            chosen = rng.permutation(len(data))[:each]
-            drawn.append(data[np.sort(chosen)].astype(np.float32))
-    return np.concatenate(drawn)
 
 
 def _as_pairs(numbers: Iterable[tuple[int, int]]) -> set[Pair]:

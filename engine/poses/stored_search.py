@@ -23,9 +23,13 @@ DATABASE = "database.db"
 """Of the first search, in the folder for the work."""
 STORED_DATABASE, SEARCH_FILE, PAIRS_FILE = "stored.db", "search.json", "pairs.json"
 STORED_MAPPINGS = "mappings.tar"
-STORED_SEARCH_FILES = (SEARCH_FILE, PAIRS_FILE, STORED_DATABASE, STORED_MAPPINGS)
-"""What is to be stored; the database says how far the search is, pairs are there after the quick look, and
-mappings are those of a large capture, see :mod:`octasplat.engine.poses.stored_mappings`."""
+VOCABULARY_FILE, VOCABULARY_RECORD = "vocabulary.bin", "vocabulary.json"
+STORED_SEARCH_FILES = (
+    SEARCH_FILE, PAIRS_FILE, STORED_DATABASE, STORED_MAPPINGS, VOCABULARY_FILE, VOCABULARY_RECORD
+)  # fmt: skip
+"""What is to be stored; the database says how far the search is, and pairs are there after the quick look.
+Of a large capture there are also mappings, see :mod:`octasplat.engine.poses.stored_mappings`,
+and the vocabulary, see :mod:`octasplat.engine.poses.vocabulary`."""
 STORED_FROM = 100
 """Photographs from which on the state is kept: the search for fewer is soon done again."""
 _STORE_SECONDS = 600.0

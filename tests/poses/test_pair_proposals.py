@@ -1,17 +1,22 @@
 """Pairs proposed for the quick look: by GPS, or by a vocabulary of the capture's features; known answers."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
 
+from octasplat.engine.core.errors import DiskFullError
 from octasplat.engine.poses.config import PosesConfig
 from octasplat.engine.poses.features import create_database, preselect_pairs
 from octasplat.engine.poses.linking_pairs import propose_links
 from octasplat.engine.poses.pair_proposals import propose_pairs
 from octasplat.engine.poses.pairs import all_pairs, pair_count, pairs_with, select_pairs
+from octasplat.engine.poses.stored_search import STORED_SEARCH_FILES
+from octasplat.engine.poses.vocabulary import alike_by_vocabulary
 from tests.support.located_scene import write_gps
+from tests.support.small_disk import files_no_larger_than
 from tests.support.tiny_dataset import make_tiny_dataset
 
 COUNT, SEEN, STEP = 60, 240, 60
@@ -56,7 +61,6 @@ def test_vocabulary_proposes_photographs_of_one_place(
     alike = {(a, b) for a, b in all_pairs(COUNT) if abs(place[a] - place[b]) <= 2}
     assert len(alike & set(proposed)) >= 0.97 * len(alike) and len(proposed) < pair_count(COUNT) / 2
     assert {(k, k + 1) for k in range(COUNT - 1)} <= set(proposed)
-    assert not path.with_name("vocabulary.bin").exists()
 
     told: list[tuple[int, float]] = []
     quick = PosesConfig(quick_look_up_to=10, large_partners=6, neighbours=1)
@@ -113,3 +117,53 @@ def test_photographs_of_one_model_are_linked_by_look_to_those_of_another(
     assert not set(links) & {*matched}
     assert {(a in rest) + 2 * (b in rest) for a, b in links} <= {1, 2}
     assert not {k for pair in links for k in pair} & {*of_no_model}
+
+
+@pytest.fixture
+def few_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Learn few words, which takes no time."""
+    monkeypatch.setattr("octasplat.engine.poses.vocabulary.TRAINING_DESCRIPTORS", 3000)
+
+
+def test_vocabulary_is_learnt_once_and_read_on_another_host(
+    street: tuple[Path, list[str], np.ndarray], tmp_path: Path, few_words: None
+) -> None:
+    def alike(work: Path, photographs: int = COUNT, seed: int = 0) -> list[tuple[int, list[int]]]:
+        small = work / "links.db"
+        shutil.copyfile(street[0], small)
+        return list(alike_by_vocabulary(small, photographs, [1, 2, 3], 8, seed=seed))
+
+    def files(work: Path) -> dict[str, tuple[int, bytes]]:
+        return {path.name: (path.stat().st_ino, path.read_bytes()) for path in work.glob("vocabulary.*")}
+
+    first, other = tmp_path / "first", tmp_path / "other"
+    first.mkdir()
+    found = alike(first)
+    learnt = files(first)
+    assert len(found) == 3 and learnt.keys() < set(STORED_SEARCH_FILES) and len(learnt) == 2
+    assert alike(first) == found and files(first) == learnt
+    other.mkdir()
+    for name in learnt:
+        shutil.copyfile(first / name, other / name)
+    fetched = files(other)
+    assert alike(other) == found and files(other) == fetched
+    # words of other features, as of a second search, and a file that is not the one of the record
+    assert alike(other, COUNT // 2) != found and files(other) != fetched
+    assert alike(first, seed=1) != [] and files(first) != learnt
+    shutil.copyfile(first / "vocabulary.bin", other / "vocabulary.bin")
+    (other / "vocabulary.json").write_bytes(learnt["vocabulary.json"][1])
+    assert alike(other) == found
+    assert {name: content for name, (_, content) in files(other).items()} == {
+        name: content for name, (_, content) in learnt.items()
+    }
+
+
+@pytest.mark.parametrize("limit_bytes", [50_000, 90_000])
+def test_full_disk_leaves_no_vocabulary(
+    street: tuple[Path, list[str], np.ndarray], tmp_path: Path, few_words: None, limit_bytes: int
+) -> None:
+    small = tmp_path / "links.db"
+    shutil.copyfile(street[0], small)
+    with files_no_larger_than(limit_bytes), pytest.raises(DiskFullError, match="free space there"):
+        list(alike_by_vocabulary(small, COUNT, [1], 8, seed=0))
+    assert not list(tmp_path.glob("*vocabulary*"))

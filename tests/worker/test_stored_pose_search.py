@@ -35,7 +35,8 @@ def test_state_of_a_search_is_restored_until_poses_are_there(tmp_path: Path) -> 
     (work / "database.db").write_bytes(b"is being written")
     assert first.store_checkpoint("features", 50) is None
     (work / STORED_DATABASE).write_bytes(b"features")
-    (work / "pairs.json").write_text("[]")
+    for name in ("pairs.json", "vocabulary.bin", "vocabulary.json"):
+        (work / name).write_text("[]")
     stored = first.store_checkpoint("features", 100)
     assert stored is not None and {file.path for file in stored.files} == {
         f"{SEARCH}/{name}" for name in BEFORE_MAPPING
