@@ -14,11 +14,15 @@ from typing import Any
 import numpy as np
 import pycolmap
 from jaxtyping import Bool, Float64, Int64
+from scipy.sparse import csr_array, diags_array
+from scipy.sparse.linalg import ArpackNoConvergence, eigsh
 
 _MAX_INLIER_SHARE_OF_FALSE_PAIR = 0.5
 """A cut is a fold if no more than so many matches across it are kept for one that is broken."""
 _MIN_INLIER_SHARE_OF_TRUE_PAIR = 0.5
 """Across a fold, pairs with this share of their matches kept are those that made it."""
+_LANCZOS_VECTORS = 60
+_MAX_LANCZOS_RESTARTS = 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,9 +88,9 @@ def find_false_pairs(votes: PairInliers) -> Int64[np.ndarray, "f 2"]:
     if len(numbers) < 3:  # two photographs cannot be parted into two groups that see different places
         return votes.pairs[:0]
     a, b = index.reshape(-1, 2).T
-    weight = np.zeros((len(numbers), len(numbers)))
-    weight[a, b] = weight[b, a] = votes.inliers - votes.outliers
-    side = _min_cut(weight)
+    balance = (votes.inliers - votes.outliers).astype(np.float64)
+    ends = (np.concatenate([a, b]), np.concatenate([b, a]))
+    side = _min_cut(csr_array((np.tile(balance, 2), ends), shape=(len(numbers), len(numbers))))
     across = side[a] != side[b]
     if (
         votes.inliers[across].sum() > _MAX_INLIER_SHARE_OF_FALSE_PAIR * votes.outliers[across].sum()
@@ -108,18 +112,21 @@ def remove_pairs(database: Path, pairs: Int64[np.ndarray, "f 2"]) -> None:
             target.delete_matches(first, second)
 
 
-def _min_cut(weight: Float64[np.ndarray, "n n"]) -> Bool[np.ndarray, " n"]:
-    """Return the sides of a cut with a small sum of weights across it."""
-    # the Fiedler vector's analog for signed weights
-    _, vectors = np.linalg.eigh(np.diag(weight.sum(axis=1)) - weight)
-    order = np.argsort(vectors[:, 0], kind="stable")
-    side = np.zeros(len(weight), dtype=bool)
+def _min_cut(weight: csr_array) -> Bool[np.ndarray, " n"]:
+    """Return the sides of a cut with a small sum of weights across it.
+
+    Args:
+        weight: n x n and symmetric; only photographs that have a pair have one.
+    """
+    order = np.argsort(_lowest_eigenvector(weight), kind="stable")
+    side = np.zeros(len(order), dtype=bool)
     best, cut = side.copy(), np.inf
     across = 0.0
     # the best cut along its order, then single moves
-    for photograph in order[:-1]:
+    for photograph in order[:-1].tolist():
+        others, weights = _edges(weight, photograph)
         # only the photograph's own edges change sides; weights are whole numbers, so that sums are exact
-        across += float(weight[photograph].sum() - 2 * weight[photograph, side].sum())
+        across += float(np.where(side[others], -weights, weights).sum())
         side[photograph] = True
         if across < cut:
             best, cut = side.copy(), across
@@ -130,25 +137,59 @@ def _min_cut(weight: Float64[np.ndarray, "n n"]) -> Bool[np.ndarray, " n"]:
         best, cut = side, across
 
 
-def _refine_cut(
-    weight: Float64[np.ndarray, "n n"], side: Bool[np.ndarray, " n"]
-) -> tuple[Bool[np.ndarray, " n"], float]:
+def _lowest_eigenvector(weight: csr_array) -> Float64[np.ndarray, " n"]:
+    """Return the Fiedler vector's analog for signed weights; zeros where it is not found in time.
+
+    By the Lanczos iterations of ARPACK, as thousands of photographs have far fewer pairs than a matrix has
+    elements.
+    """
+    count = weight.shape[0]
+    laplacian = (diags_array(weight.sum(axis=1)) - weight).tocsr()
+    start = np.random.Generator(np.random.PCG64(0)).standard_normal(count)
+    try:
+        _, vectors = eigsh(
+            laplacian,
+            k=1,
+            which="SA",
+            v0=start,
+            ncv=min(count, _LANCZOS_VECTORS),
+            maxiter=_MAX_LANCZOS_RESTARTS,
+        )
+    except ArpackNoConvergence:
+        return np.zeros(count)
+    return np.asarray(vectors[:, 0])
+
+
+def _edges(weight: csr_array, photograph: int) -> tuple[Int64[np.ndarray, " e"], Float64[np.ndarray, " e"]]:
+    """Return the photographs that one has pairs with, and the weights of these pairs."""
+    own = slice(weight.indptr[photograph], weight.indptr[photograph + 1])
+    return np.asarray(weight.indices[own], np.int64), weight.data[own]
+
+
+def _refine_cut(weight: csr_array, side: Bool[np.ndarray, " n"]) -> tuple[Bool[np.ndarray, " n"], float]:
     """Return the best cut met while moving each photograph once, the most profitable one first.
 
     Kernighan and Lin, "An Efficient Heuristic Procedure for Partitioning Graphs" (1970), without swaps.
     """
     sign = np.where(side, 1.0, -1.0)
-    total = weight.sum()
-    best, least = side, np.inf
-    open_ = np.ones(len(sign), dtype=bool)
+    total, balance = float(weight.sum()), float(sign.sum())
     pull = weight @ sign
+    signed = float(sign @ pull)
+    best, least = side, np.inf
+    is_open = np.ones(len(sign), dtype=bool)
+    profit = -sign * pull
     for _ in range(len(sign)):
-        photograph = int(np.argmax(np.where(open_, -sign * pull, -np.inf)))
+        photograph = int(np.argmax(profit))
+        signed -= 4 * sign[photograph] * pull[photograph]
         sign[photograph] = -sign[photograph]
+        balance += 2 * sign[photograph]
+        is_open[photograph] = False
         # only the moved photograph's edges have changed
-        pull += 2 * sign[photograph] * weight[:, photograph]
-        open_[photograph] = False
-        across = float(total - sign @ pull) / 4  # cut = (sum of all weights - sum of signed ones) / 4
-        if across < least and abs(sign.sum()) < len(sign):  # both sides have photographs
+        others, weights = _edges(weight, photograph)
+        pull[others] += 2 * sign[photograph] * weights
+        profit[others] = np.where(is_open[others], -sign[others] * pull[others], -np.inf)
+        profit[photograph] = -np.inf
+        across = (total - signed) / 4  # cut = (sum of all weights - sum of signed ones) / 4
+        if across < least and abs(balance) < len(sign):  # both sides have photographs
             best, least = sign > 0, across
     return best, least
