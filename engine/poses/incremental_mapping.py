@@ -83,6 +83,7 @@ def map_in_segments(
     allow_weak_links: bool = False,
     start: Path | None = None,
     apart: Sequence[Any] = (),
+    left_out: Collection[int] = (),
     extends_only: bool = False,
 ) -> list[Any]:
     """Reconstruct a large capture as :func:`map_photographs` does, with less effort for each photograph.
@@ -99,6 +100,7 @@ def map_in_segments(
         allow_weak_links: place photographs by fewer matches, too.
         start: folder of a model to go on from.
         apart: complete models, whose photographs are not mapped again.
+        left_out: indices of further photographs that are not mapped.
         extends_only: map no models beside ``start``.
 
     Returns:
@@ -113,7 +115,7 @@ def map_in_segments(
     options.ba_local_function_tolerance = _COMPLETE_TOLERANCE
     count = _Count(on_count)
     while not stored.state.is_done:
-        _map_segment(options, database, stored, start, apart, count)
+        _map_segment(options, database, stored, start, apart, left_out, count)
     models = stored.models()
     count.tell(len(photograph_indices([*apart, *models])))
     return sorted(models, key=model_rank, reverse=True)
@@ -125,6 +127,7 @@ def _map_segment(
     stored: StoredMapping,
     start: Path | None,
     apart: Sequence[Any],
+    left_out: Collection[int],
     count: "_Count",
 ) -> None:
     """Map until a segment ends or there is no more to map, and write the state."""
@@ -132,7 +135,7 @@ def _map_segment(
     if (begun := stored.state.current or start) is not None:
         manager.read(begun)
     finished = [*apart, *stored.models()]
-    options.image_names = _names_left(database, finished, _all_models(manager))
+    options.image_names = _names_left(database, finished, _all_models(manager), left_out)
     is_segment_end = _run_mapper(
         options, database, manager, count, ends_segments=True, finished=photograph_indices(finished)
     )
@@ -283,17 +286,19 @@ def _all_models(manager: Any) -> list[Any]:
     return [manager.get(k) for k in range(manager.size())]
 
 
-def _names_left(database: Path, finished: Sequence[Any], current: Sequence[Any]) -> list[str]:
-    """Return the names of the photographs that no finished model has, and of those of the current one.
+def _names_left(
+    database: Path, finished: Sequence[Any], current: Sequence[Any], left_out: Collection[int]
+) -> list[str]:
+    """Return the names of the photographs to map: not those of finished models alone, or of ``left_out``.
 
-    Empty, which COLMAP takes for all of them, where no model is finished.
+    Empty, which COLMAP takes for all of them, where no model is finished and none is left out.
     """
-    if not finished:
+    if not finished and not left_out:
         return []
     with pycolmap.Database.open(database) as source:
         names = {image.image_id: image.name for image in source.read_all_images()}
-    placed, kept = photograph_indices(finished), photograph_indices(current)
-    return sorted(name for number, name in names.items() if number - 1 not in placed or number - 1 in kept)
+    away = (photograph_indices(finished) | set(left_out)) - photograph_indices(current)
+    return sorted(name for number, name in names.items() if number - 1 not in away)
 
 
 def model_rank(model: Any) -> tuple[int, int]:

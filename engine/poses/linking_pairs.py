@@ -1,4 +1,4 @@
-"""Pairs that may link photographs of a large capture that were left out to those of its largest model.
+"""Pairs that may link photographs of a large capture that were left out to those of its models.
 
 A part of a capture that stays apart is most alike to itself, so that proposals for the quick look seldom lead
 out of it. Here only photographs that have poses are proposed: the nearest by GPS where a photograph has it,
@@ -15,8 +15,9 @@ import pycolmap
 
 from octasplat.engine.poses.config import PRESELECTION_FEATURES, PRESELECTION_MATCHES, PosesConfig
 from octasplat.engine.poses.features import copy_largest_features, look_at_pairs, match_pairs
-from octasplat.engine.poses.pair_proposals import alike_by_vocabulary, gps_positions_m
+from octasplat.engine.poses.pair_proposals import gps_positions_m
 from octasplat.engine.poses.pairs import Pair, pairs_with
+from octasplat.engine.poses.vocabulary import alike_by_vocabulary
 
 LINKS_PER_PHOTOGRAPH = 30
 """Photographs with poses that one without is matched with."""
@@ -92,14 +93,14 @@ def match_remaining(
 ) -> None:
     """Match photographs of no model with all others, and take matches that are less clear.
 
-    In a large capture the others are those near by name, and those of the largest model that are near
-    by GPS or look most alike.
+    In a large capture the others are those near by name, and those of any model that are near by GPS or look
+    most alike.
 
     Args:
         database: with features; gets the matches.
         names: of all photographs, as they are numbered.
         rest: indices of those of no model.
-        posed: of those of the largest model.
+        posed: of those of the models that are kept.
         matched: pairs that were matched already.
         config: settings.
         threads: to use; -1 means all cores.

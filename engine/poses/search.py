@@ -1,8 +1,9 @@
 """The search for poses, from photographs to a model that can be trusted; runs in a process of its own."""
 
 import sqlite3
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,6 @@ from octasplat.engine.poses.disambiguation import (
     MappedModels,
     disambiguate,
     leave_out_pairs_before_mapping,
-    register_without_pairs_against_gps,
 )
 from octasplat.engine.poses.features import (
     create_database,
@@ -37,22 +37,20 @@ from octasplat.engine.poses.features import (
     preselect_pairs,
 )
 from octasplat.engine.poses.found_models import write_other_models
-from octasplat.engine.poses.gps_contradictions import GroundPositions, read_ground_positions
+from octasplat.engine.poses.gps_contradictions import read_ground_positions
 from octasplat.engine.poses.incremental_mapping import (
     best_rank,
     map_in_segments,
     map_photographs,
-    model_rank,
-    take_out_unsure,
 )
-from octasplat.engine.poses.linking_pairs import match_links, match_remaining, propose_links
-from octasplat.engine.poses.model_selection import distinct_models, model_facts, photograph_indices
+from octasplat.engine.poses.model_selection import distinct_models, model_facts
 from octasplat.engine.poses.pairs import Pair, all_pairs, pair_count
 from octasplat.engine.poses.photograph_check import (
     check_photographs_decode,
     read_image_infos,
     warn_of_small_photographs,
 )
+from octasplat.engine.poses.remaining_photographs import register_remaining
 from octasplat.engine.poses.search_check import check_mapped, search_rank
 from octasplat.engine.poses.stored_mappings import (
     MAPPINGS_FOLDER,
@@ -172,7 +170,16 @@ class PoseSearch:
                 self._map(database, at), database, ground_m, lambda copy: self._map(copy, at)
             )
             if best_rank(mapped.models)[0] < count:
-                mapped = self._register_remaining(database, mapped, matched, ground_m, at)
+                mapped = register_remaining(
+                    database,
+                    self._aliases,
+                    mapped,
+                    matched,
+                    ground_m,
+                    self._config,
+                    partial(self._map, at=at),
+                    threads=self._threads,
+                )
             at(mapped.placed(count))
         return mapped
 
@@ -248,58 +255,6 @@ class PoseSearch:
             keeper.keep(total, is_final=True)
         return pairs
 
-    def _register_remaining(
-        self,
-        database: Path,
-        mapped: MappedModels,
-        matched: list[Pair],
-        ground_m: GroundPositions,
-        at: Callable[[int], None],
-    ) -> MappedModels:
-        """Register photographs that the largest model leaves out.
-
-        Those of no model that is kept need fewer matches, other models of a large capture more.
-        """
-        config, count = self._config, len(self._names)
-        apart = self._kept_apart(mapped)
-        posed = photograph_indices(mapped.models[:1])
-        if of_others := sorted(photograph_indices(apart) - posed):
-            links = propose_links(database, count, of_others, posed, matched, seed=config.seed)
-            if match_links(database, self._aliases, links, config, threads=self._threads):
-                start = self._write_start(mapped)
-
-                def extend(copy: Path) -> list[Any]:
-                    return [*self._map(copy, at, start=start, extends_only=True), *apart]
-
-                mapped = register_without_pairs_against_gps(mapped, database, ground_m, extend)
-                posed = photograph_indices(mapped.models[:1])
-                apart = self._kept_apart(mapped)
-        rest = sorted(set(range(count)) - posed - photograph_indices(apart))
-        if not rest:
-            return mapped
-        match_remaining(database, self._aliases, rest, posed, matched, config, threads=self._threads)
-        start = self._write_start(mapped)
-
-        def map_weakly(copy: Path) -> list[Any]:
-            models = self._map(copy, at, allow_weak_links=True, start=start, apart=apart)
-            for model in models if config.is_large(count) else []:
-                take_out_unsure(model, posed)
-            return sorted([*models, *apart], key=model_rank, reverse=True)
-
-        return register_without_pairs_against_gps(mapped, database, ground_m, map_weakly)
-
-    def _kept_apart(self, mapped: MappedModels) -> list[Any]:
-        """Return the models of a large capture that are kept beside the largest one."""
-        return distinct_models(mapped.models)[1:] if self._config.is_large(len(self._names)) else []
-
-    def _write_start(self, mapped: MappedModels) -> Path | None:
-        """Write the largest model, for a mapping to go on from, and return its folder."""
-        if not mapped.models:
-            return None
-        start = self._work / "start"
-        write_model(mapped.models[0], start)
-        return start
-
     def _map(
         self,
         database: Path,
@@ -308,6 +263,7 @@ class PoseSearch:
         allow_weak_links: bool = False,
         start: Path | None = None,
         apart: Sequence[Any] = (),
+        left_out: Collection[int] = (),
         extends_only: bool = False,
     ) -> list[Any]:
         seed = self._config.seed
@@ -326,6 +282,7 @@ class PoseSearch:
             allow_weak_links=allow_weak_links,
             start=start,
             apart=apart,
+            left_out=left_out,
             extends_only=extends_only,
         )
 

@@ -1,16 +1,24 @@
 """Photographs that the largest model of a large capture leaves out: of other models, and of none."""
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pycolmap
 import pytest
 
-from octasplat.engine.poses import search as module
+from octasplat.engine.poses import linking_pairs, vocabulary
+from octasplat.engine.poses import remaining_photographs as module
+from octasplat.engine.poses.ambiguous_structure import remove_pairs
 from octasplat.engine.poses.config import PosesConfig
 from octasplat.engine.poses.disambiguation import MappedModels
-from octasplat.engine.poses.search import PoseSearch
+from octasplat.engine.poses.features import photographs_of
+from octasplat.engine.poses.incremental_mapping import map_in_segments
+from octasplat.engine.poses.remaining_photographs import register_remaining
+from octasplat.engine.poses.stored_mappings import StoredMapping, matches_digest
 
 COUNT = 20
 LARGE = PosesConfig(exhaustive_up_to=6, quick_look_up_to=10)
@@ -48,20 +56,22 @@ def register(
     """Register what is left; return the models, what is linked and matched, and what is not mapped again."""
     asked: dict[str, list[int]] = {}
     apart: list[tuple[StubModel, ...]] = []
-    search = PoseSearch.__new__(PoseSearch)
-    search._config, search._names, search._aliases = LARGE, ("",) * COUNT, ("",) * COUNT
-    search._threads, search._work = 1, Path()
 
     def propose(_database: Path, _count: int, rest: Sequence[int], *_more: Any, **_named: Any) -> list[Any]:
         asked["linked"] = list(rest)
         return []
 
     def match(
-        _database: Path, _names: Sequence[str], rest: Sequence[int], *_more: Any, **_named: Any
+        _database: Path,
+        _names: Sequence[str],
+        rest: Sequence[int],
+        posed: set[int],
+        *_more: Any,
+        **_named: Any,
     ) -> None:
-        asked["matched"] = list(rest)
+        asked["matched"], asked["with"] = list(rest), sorted(posed)
 
-    def go_on(_database: Path, _at: Any, *, extends_only: bool = False, **named: Any) -> list[Any]:
+    def go_on(_database: Path, *, extends_only: bool = False, **named: Any) -> list[Any]:
         if extends_only:
             return [extended]
         apart.append(tuple(named["apart"]))
@@ -71,9 +81,9 @@ def register(
     monkeypatch.setattr(module, "match_links", lambda *_given, **_named: extended is not None)
     monkeypatch.setattr(module, "match_remaining", match)
     monkeypatch.setattr(module, "write_model", lambda *_given: None)
-    monkeypatch.setattr(search, "_map", go_on)
+    monkeypatch.setattr(module, "_clearest_models", lambda *_given: {})
     before = MappedModels([LARGEST, OTHER, SHARED, DOUBTFUL])
-    after = search._register_remaining(Path(), before, [], {}, lambda _count: None)
+    after = register_remaining(Path("mapping.db"), ("",) * COUNT, before, [], {}, LARGE, go_on, threads=1)
     return after.models, asked, apart
 
 
@@ -81,7 +91,9 @@ def test_photographs_of_models_that_are_not_kept_are_matched_like_those_of_none(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     _, asked, apart = register(monkeypatch, None)
-    assert asked == {"linked": [10, 11, 12, 13], "matched": [14, 15, 16, 17, 18, 19]}
+    assert asked == {
+        "linked": [10, 11, 12, 13], "matched": [14, 15, 16, 17, 18, 19], "with": list(range(14))
+    }  # fmt: skip
     assert apart == [(OTHER,)]
 
 
@@ -90,5 +102,65 @@ def test_rest_of_a_model_that_has_joined_the_largest_one_is_matched_like_photogr
 ) -> None:
     extended = StubModel((*LARGEST.images, 11, 12))
     models, asked, apart = register(monkeypatch, extended)
-    assert asked == {"linked": [10, 11, 12, 13], "matched": [12, 13, 14, 15, 16, 17, 18, 19]}
+    assert asked == {
+        "linked": [10, 11, 12, 13], "matched": list(range(12, 20)), "with": list(range(12))
+    }  # fmt: skip
     assert apart == [()] and models[0] == extended
+
+
+FIRST, SECOND = 14, 10
+"""Photographs of two places that nothing links, the last two of each without matches."""
+LATE = (FIRST - 2, FIRST - 1, FIRST + SECOND - 2, FIRST + SECOND - 1)
+
+
+@pytest.fixture(scope="module")
+def apart(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a database of two places, with features and matches."""
+    path = tmp_path_factory.mktemp("apart") / "database.db"
+    pycolmap.set_random_seed(1)
+    with pycolmap.Database.open(path) as database:
+        for count in (FIRST, SECOND):
+            options = pycolmap.SyntheticDatasetOptions()
+            options.num_rigs = options.num_cameras_per_rig = 1
+            options.num_frames_per_rig = count
+            options.num_points3D = 300
+            pycolmap.synthesize_dataset(options, database)
+    others = range(FIRST + SECOND)
+    pairs = {(min(k, other), max(k, other)) for k in LATE for other in others if k != other}
+    remove_pairs(path, np.array(sorted(pairs)) + 1)
+    return path
+
+
+def verified_pairs(database: Path) -> int:
+    with pycolmap.Database.open(database) as opened:
+        return int(opened.num_verified_image_pairs())
+
+
+def found_photographs(database: Path) -> list[list[int]]:
+    """Map and register what is left; return the photographs of each model."""
+    names = photographs_of(database)
+    mappings: list[Path] = []
+
+    def go_on(copy: Path, **how: Any) -> list[Any]:
+        mappings.append(database.with_name(f"mapping_{len(mappings)}"))
+        stored = StoredMapping(mappings[-1], matches_digest(copy), lambda _count: None)
+        return map_in_segments(copy, stored, seed=0, on_count=lambda _count: None, **how)
+
+    mapped = MappedModels(go_on(database))
+    assert [model.num_reg_images() for model in mapped.models] == [FIRST - 2, SECOND - 2]
+    after = register_remaining(database, names, mapped, [], {}, LARGE, go_on, threads=1)
+    return [sorted(number - 1 for number in model.reg_image_ids()) for model in after.models]
+
+
+def test_photographs_of_no_model_join_the_one_that_they_see(
+    apart: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(linking_pairs, "MAX_LINKS", 2)
+    monkeypatch.setattr(linking_pairs, "LINKS_PER_PHOTOGRAPH", 6)
+    monkeypatch.setattr(linking_pairs, "NEIGHBORS_BY_NAME", 2)
+    monkeypatch.setattr(vocabulary, "TRAINING_DESCRIPTORS", 2000)
+    database = tmp_path / "mapping.db"
+    shutil.copyfile(apart, database)
+    before = verified_pairs(database)
+    assert found_photographs(database) == [list(range(FIRST)), list(range(FIRST, FIRST + SECOND))]
+    assert verified_pairs(database) <= before + 2 + len(LATE) * (6 + 2 * 2)
