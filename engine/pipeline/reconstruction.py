@@ -8,6 +8,7 @@ from octasplat.engine.blocks.piece_settings import require_blocks_possible
 from octasplat.engine.core.errors import CheckpointError, ConfigError
 from octasplat.engine.core.events import EventListener, JsonLinesWriter, RunFinished, broadcast
 from octasplat.engine.core.threads import use_threads
+from octasplat.engine.core.writing import restore_folder
 from octasplat.engine.dataset.views_file import ViewsRecord, read_views
 from octasplat.engine.files import check_writable
 from octasplat.engine.pipeline.block_request import BlockRequest, keep_request
@@ -21,7 +22,7 @@ from octasplat.engine.pipeline.run_lock import lock_run_folder
 from octasplat.engine.pipeline.start_scene import keep_found_models, keep_start
 from octasplat.engine.pipeline.train_step import TrainStep
 from octasplat.engine.runs.config import ReconstructionConfig
-from octasplat.engine.runs.run_folder import CACHE, EVENTS, SCENE, VIEWS
+from octasplat.engine.runs.run_folder import CACHE, EVENTS, POSES, SCENE, VIEWS
 
 DATASET_STEPS = (FindPoses(), OpenDataset())
 """The steps that may refuse the photographs or the settings."""
@@ -89,6 +90,7 @@ def reconstruct(
     # before the claim, which makes the folder
     is_made, is_new = not output.exists(), claim_output(scene, output, config, resume)
     with lock_run_folder(output):
+        restore_folder(output / POSES)  # before anything looks for poses, which might be found or copied anew
         with release_on_refusal(output, is_new=is_new, is_made=is_made):
             blocks = keep_request(output, blocks, is_new=is_new)
             keep_start(scene, output, start_from, is_new=is_new)

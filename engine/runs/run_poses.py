@@ -9,7 +9,6 @@ from jaxtyping import Int64
 from octasplat.engine.core.errors import CancelledError, ColmapCrashError, DatasetError
 from octasplat.engine.core.events import EventListener, PhaseProgress, Warned
 from octasplat.engine.core.progress import phase
-from octasplat.engine.core.writing import restore_folder
 from octasplat.engine.dataset import Dataset, split_views
 from octasplat.engine.dataset.model_sources import find_model, has_model
 from octasplat.engine.dataset.photograph_files import image_folder
@@ -57,7 +56,6 @@ def find_missing_poses(
         ColmapCrashError: COLMAP died.
         CancelledError: stopped as asked.
     """
-    restore_folder(output / POSES)
     if config.with_poses_decided(has_model(scene)).poses == "given":
         return
     names = photographs_of_scene(scene)

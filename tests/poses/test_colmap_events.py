@@ -13,7 +13,7 @@ import pytest
 
 from octasplat.engine.core.errors import CancelledError, ColmapCrashError, DiskFullError
 from octasplat.engine.core.events import Event, PhaseFinished, PhaseProgress, PhaseStarted, Warned
-from octasplat.engine.core.writing import write_json
+from octasplat.engine.core.writing import restore_folder, write_json
 from octasplat.engine.pipeline.output_folder import claim_output, release_on_refusal
 from octasplat.engine.poses import find_poses as module
 from octasplat.engine.poses.config import (
@@ -119,6 +119,7 @@ def test_run_killed_while_lenses_are_adjusted_keeps_its_poses(
     with killed_before_rename(renames):
         module.adjust_principal_points(output / "poses", output / "poses")
     config = ReconstructionConfig(poses="auto")
+    restore_folder(output / "poses")
     find_missing_poses(scene, output, config, 1, lambda _event: None, lambda: False)
     expected = former if renames < 2 else {**former, "lenses": facts}
     assert read_pose_record(output / "poses") == expected

@@ -1,7 +1,9 @@
 """Models that are found beside the one that is taken: kept, told, and taken in its place."""
 
 import json
+import shutil
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,8 +14,10 @@ import pytest
 
 from octasplat.engine.core.errors import ConfigError, DatasetError
 from octasplat.engine.core.events import Event, Warned
+from octasplat.engine.core.writing import restore_folder
 from octasplat.engine.operations.estimate import estimate_scene
 from octasplat.engine.operations.photograph_sizes import photograph_sizes
+from octasplat.engine.pipeline import reconstruct
 from octasplat.engine.pipeline.start_scene import keep_found_models
 from octasplat.engine.poses.found_models import (
     choose_found_model,
@@ -139,10 +143,29 @@ def test_run_killed_while_it_chooses_a_model_goes_on_with_its_search(tmp_path: P
     config = ReconstructionConfig(poses="auto", model="poses/1")
     with killed_before_rename(renames):
         choose_found_model(output / "poses", 1)
+    restore_folder(output / "poses")
     find_missing_poses(scene, output, config, 1, lambda _event: None, lambda: False)
     assert (output / "poses" / "images.bin").read_text() == "1"
     assert [model.number for model in other_models(output / "poses")] == [0, 2]
     assert [path.name for path in output.iterdir()] == ["poses"]
+
+
+@pytest.mark.parametrize("renames", range(1, 12))
+def test_run_killed_while_it_chooses_among_copied_models_does_not_copy_them_again(
+    tmp_path: Path, renames: int
+) -> None:
+    scene, source, output = (tmp_path / name for name in ("scene", "source", "run"))
+    write_found(source / "poses", photographs_sha256=write_photographs(scene))
+    config = ReconstructionConfig(model=str(source / "poses" / "1"))
+    with killed_before_rename(renames), suppress(DatasetError):  # these models cannot be opened
+        reconstruct(scene, output, config)
+    # on another host that has only the folder of the run
+    shutil.rmtree(source)
+    with pytest.raises(DatasetError):
+        reconstruct(scene, output, config, resume=True)
+    assert (output / "poses" / "images.bin").read_text() == "1"
+    assert [model.number for model in other_models(output / "poses")] == [0, 2]
+    assert not (output / ".poses.former").exists()
 
 
 def test_other_models_stay_where_lenses_are_adjusted(tmp_path: Path) -> None:
