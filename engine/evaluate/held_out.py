@@ -15,7 +15,7 @@ from octasplat.engine.core.read_ahead import read_ahead
 from octasplat.engine.core.threads import threads_in_use
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset import Dataset
-from octasplat.engine.evaluate.advice import ViewFacts, advise, fine_detail, support_groups
+from octasplat.engine.evaluate.advice import ViewFacts, advise, common_structure, fine_detail, support_groups
 from octasplat.engine.evaluate.gallery import ViewImages, WorstAndBestViews
 from octasplat.engine.evaluate.ground_truth import GroundTruth
 from octasplat.engine.evaluate.ground_truth_measures import GroundTruthMeasures
@@ -245,8 +245,12 @@ def _finish_views(
     def finish(view: RenderedView) -> _FinishedView:
         measured = measure_view(view, threads // workers)
         write(view)
-        photograph_detail = fine_detail(view.reference, view.weight)
-        facts = ViewFacts(photograph_detail, fine_detail(view.render, view.weight), view.support)
+        facts = ViewFacts(
+            fine_detail(view.reference, view.weight),
+            fine_detail(view.render, view.weight),
+            view.support,
+            common_structure(view.render, view.reference, view.weight),
+        )
         return _FinishedView(view, measured, facts)
 
     if workers == 1:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.evaluate.advice import ViewFacts, advise, fine_detail
+from octasplat.engine.evaluate.advice import ViewFacts, advise, common_structure, fine_detail
 from octasplat.engine.evaluate.gallery import magma
 from octasplat.engine.evaluate.summary import summarize_run
 from octasplat.engine.evaluate.view_metrics import ViewMetrics
@@ -21,9 +21,11 @@ def view(name: str, psnr: float, corrected: float | None = None) -> ViewMetrics:
     return ViewMetrics(name, 8, 8, psnr, psnr if corrected is None else corrected, None, None, None, None)
 
 
-def facts(counts: list[int], errors: list[float], detail: tuple[float, float] = (1.0, 1.0)) -> ViewFacts:
+def facts(
+    counts: list[int], errors: list[float], detail: tuple[float, float] = (1.0, 1.0), structure: float = 0.9
+) -> ViewFacts:
     support = Support(np.arange(len(counts)), np.array(counts), np.array(errors))
-    return ViewFacts(*detail, support)
+    return ViewFacts(*detail, support, structure)
 
 
 WELL_COVERED = facts([9] * 10, [0.001] * 10)
@@ -62,6 +64,41 @@ def test_other_colors_and_blur_are_named() -> None:
     assert "1 held-out photographs are less sharp than their renders (blurred)" in sentence
     # less detail than the render's alone may be noise of the render
     assert "sharp" not in told(view("smooth", 27.0), view("b", 27.0), smooth=facts([9], [0.001], (0.9, 3.0)))
+
+
+def test_photographs_in_a_wrong_place_are_not_told_to_have_other_colors() -> None:
+    dark, astray = facts([9], [0.001], structure=0.6), facts([9], [0.001], structure=0.2)
+    views = [view("dark", 20.0, 25.0), view("even", 28.0, 28.2), view("astray", 15.0, 19.0), view("b", 27.0)]
+    sentence = told(*views, dark=dark, astray=astray)
+    assert "1 held-out photographs have other colors than the rest (dark)" in sentence
+    assert "1 held-out photographs show other things than the scene does" in sentence
+    assert "other colors (astray): their poses are more likely wrong" in sentence
+    # where nothing has much in common, as after a short training, nothing stands out
+    poor = facts([9], [0.001], structure=0.2)
+    assert "have other colors than the rest (dark, astray)" in told(
+        *views, dark=poor, astray=poor, even=poor, b=poor
+    )
+
+
+def room(shift_px: int) -> np.ndarray:
+    """Return a picture of boards of other brightness, from a place that is moved along them."""
+    rng = np.random.default_rng(0)
+    boards = np.kron(rng.uniform(0.2, 0.6, (24, 64)), np.ones((12, 12)))[:, shift_px : shift_px + 360]
+    return np.repeat(boards[..., None], 3, axis=2).astype(np.float32)
+
+
+def test_common_structure_is_that_of_one_place_in_whatever_colors() -> None:
+    here, there, whole = room(0), room(204), np.ones((288, 360), np.float32)
+    other_light = np.clip(here * np.array([1.5, 1.0, 0.6]) + np.linspace(0, 0.3, 360)[None, :, None], 0, 1)
+    assert common_structure(here, here, whole) == pytest.approx(1.0)
+    assert common_structure(here, other_light.astype(np.float32), whole) > 0.95
+    assert abs(common_structure(there, here, whole)) < 0.15
+    half = np.zeros_like(whole)
+    half[:, :180] = 1.0
+    mixed = np.where(half[..., None] > 0, here, there)
+    assert common_structure(mixed, here, half) == pytest.approx(1.0)
+    assert np.isnan(common_structure(here, np.full_like(here, 0.5), whole))
+    assert np.isnan(common_structure(here, here, np.zeros_like(whole)))
 
 
 @pytest.mark.parametrize(
