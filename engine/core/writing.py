@@ -79,7 +79,7 @@ def replace_folder(folder: Path, new: Path) -> None:
 
     For a process that is killed meanwhile see :func:`restore_folder`.
     """
-    former = _former_folder(folder)
+    former = former_folder(folder)
     shutil.rmtree(former, ignore_errors=True)
     if folder.is_dir():  # no system function exchanges two folders everywhere
         folder.rename(former)
@@ -89,11 +89,12 @@ def replace_folder(folder: Path, new: Path) -> None:
 
 def restore_folder(folder: Path) -> None:
     """Put the former folder back where :func:`replace_folder` was killed before the new one was there."""
-    former = _former_folder(folder)
+    former = former_folder(folder)
     if former.is_dir() and not folder.exists():
         former.rename(folder)
     shutil.rmtree(former, ignore_errors=True)
 
 
-def _former_folder(folder: Path) -> Path:
+def former_folder(folder: Path) -> Path:
+    """Return where the former folder is while :func:`replace_folder` exchanges it."""
     return folder.with_name(f".{folder.name}.former")

@@ -8,6 +8,7 @@ from uuid import uuid4
 
 import pytest
 
+from octasplat.engine.core.writing import replace_folder
 from octasplat.engine.pipeline.block_request import BlockRequest, keep_request
 from octasplat.engine.poses.stored_search import STORED_DATABASE, STORED_MAPPINGS, STORED_SEARCH_FILES
 from octasplat.workers.db.rows import Job
@@ -104,6 +105,68 @@ def test_state_of_a_mapping_is_stored_with_what_was_matched(tmp_path: Path) -> N
     assert stored.is_after(Checkpoint(1, "matches", 2000, ())) and not stored.is_after(
         Checkpoint(1, "poses", 2000, ())  # as many photographs as the found poses are of
     )
+    workspace.close()
+
+
+def write_poses(folder: Path, model: str) -> None:
+    """Write two found models whose files say which one is taken."""
+    for name in ("0/images.bin", "cameras.bin", "images.bin", "poses.json"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(model)
+
+
+@pytest.mark.parametrize("stored_before", range(5))
+def test_poses_that_are_exchanged_while_they_are_stored_are_those_of_one_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stored_before: int
+) -> None:
+    storage = LocalStorage(tmp_path / "store", floor_bytes=0)
+    workspace = Workspace(tmp_path / "work", make_job(1), storage)
+    workspace.open()
+    keep_request(workspace.folder / "run", BlockRequest(), is_new=True)
+    poses, new = workspace.folder / "run" / "poses", workspace.folder / "run" / ".poses.chosen"
+    write_poses(poses, "first")
+    write_poses(new, "second")
+    opened, open_writer = itertools.count(), storage.open_writer
+
+    def exchange_then_open() -> Any:
+        if next(opened) == stored_before:
+            replace_folder(poses, new)
+        return open_writer()
+
+    monkeypatch.setattr(storage, "open_writer", exchange_then_open)
+    stored = workspace.store_checkpoint("poses", 9)
+    assert stored is not None
+    again = Workspace(tmp_path / "work", make_job(2), storage)
+    again.open()
+    again.restore(stored)
+    found = [path.read_text() for path in (again.folder / "run" / "poses").rglob("*.*")]
+    assert found == ["second"] * 4
+    for each in (workspace, again):
+        each.close()
+
+
+@pytest.mark.parametrize("waits", [1, 99])
+def test_poses_are_not_missing_while_they_are_exchanged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, waits: int
+) -> None:
+    workspace = Workspace(tmp_path / "work", make_job(1), LocalStorage(tmp_path / "store", floor_bytes=0))
+    workspace.open()
+    keep_request(workspace.folder / "run", BlockRequest(), is_new=True)
+    run = workspace.folder / "run"
+    write_poses(run / ".poses.former", "first")
+    write_poses(run / ".poses.chosen", "second")
+    waited = itertools.count(1)
+
+    def wait(_seconds: float) -> None:
+        if next(waited) == waits:
+            (run / ".poses.chosen").rename(run / "poses")
+
+    monkeypatch.setattr("octasplat.workers.worker.workspace.time.sleep", wait)
+    stored = workspace.store_checkpoint("poses", 9)
+    if waits > 1:  # the process was killed: what was stored before stays
+        assert stored is None
+    else:
+        assert stored is not None and "run/poses/0/images.bin" in {file.path for file in stored.files}
     workspace.close()
 
 

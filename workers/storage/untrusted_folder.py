@@ -90,6 +90,22 @@ class UntrustedFolder:
         finally:
             os.close(fd)
 
+    def state(self, name: str) -> tuple[int, ...] | None:
+        """Return what tells a folder from one that takes its place, or that gets other files; None for none.
+
+        Args:
+            name: of the folder, relative to this one.
+        """
+        try:
+            fd = self._open_beneath(name, _FOLDER_FLAGS)
+        except OSError:
+            return None
+        try:
+            facts = os.fstat(fd)
+            return facts.st_dev, facts.st_ino, facts.st_mtime_ns
+        finally:
+            os.close(fd)
+
     def remove(self, name: str) -> None:
         """Remove a file, if it is there, or the link that is in its place."""
         parent, _, last = name.rpartition("/")

@@ -4,20 +4,13 @@ import contextlib
 import json
 import logging
 import math
-import re
 import time
 import uuid
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import IO
 
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.poses.stored_search import (
-    STORED_DATABASE,
-    STORED_MAPPINGS,
-    STORED_SEARCH_FILES,
-    search_folder,
-)
 from octasplat.workers.db.rows import Artifact, DatasetFile, Job
 from octasplat.workers.queue.job_results import ResultFile
 from octasplat.workers.sandbox.job_users import JobUser, give_folder, open_for_reading, take_user
@@ -41,12 +34,12 @@ from octasplat.workers.storage.trees import (
 )
 from octasplat.workers.storage.untrusted_folder import UntrustedFolder
 from octasplat.workers.worker.checkpoint import Checkpoint
+from octasplat.workers.worker.checkpoint_files import checkpoint_files, poses_state
 from octasplat.workers.worker.dataset_folder import DatasetFolder
 from octasplat.workers.worker.media_types import media_type
 from octasplat.workers.worker.start_files import START_RECORD
 from octasplat.workers.worker.stored_frames import StoredFrames, removes_stored_frames
 from octasplat.workers.worker.task import (
-    BLOCKS_FOLDER,
     FILES_FOLDER,
     POSES_FOLDER,
     RESULTS_FOLDER,
@@ -56,19 +49,6 @@ from octasplat.workers.worker.workspace_locks import LOCK_FILE, open_locked
 
 logger = logging.getLogger(__name__)
 
-_CHECKPOINT = re.compile(r"run/checkpoints/iteration_\d+\.npz")
-_CHECKPOINT_FILES = (
-    "run/config.json", "run/held_out.json", "run/views.json", "run/events.jsonl", "run/training.json",
-    "run/plan.json", "run/georeference.json", "run/scene.ply", "run/checkpoints/best.npz",
-    "run/background.exr", "run/environment.exr", "run/environment.hdr",
-    "run/start/best.npz", "run/start/views.json", START_RECORD,
-)  # fmt: skip
-_SEARCH_FILES = tuple(
-    f"{RUN_FOLDER}/{search_folder(Path(POSES_FOLDER)).name}/{name}" for name in STORED_SEARCH_FILES
-)
-_BLOCKS = f"{RUN_FOLDER}/{BLOCKS_FOLDER}"
-_BLOCK = re.compile(r"block_\d+")
-"""The pieces of which each has a job of its own."""
 _MAX_TRIES = 5
 METRICS_FILE = "metrics.json"
 MAX_METRICS_BYTES = 16 << 20
@@ -270,9 +250,18 @@ class Workspace:
         self.stored_frames = StoredFrames(self.folder, are_removed=removes_stored_frames(self._job))
 
     def store_checkpoint(self, stage: str, step: int) -> Checkpoint | None:
-        """Store what a later attempt needs to resume; None if there is nothing yet."""
-        for _ in range(_MAX_TRIES):
-            names = self._checkpoint_files(stage)
+        """Store what a later attempt needs to resume; None if there is nothing yet.
+
+        Poses are those of one model folder, whole: one that is exchanged meanwhile is stored again.
+        """
+        for attempt in range(_MAX_TRIES):
+            if attempt:
+                time.sleep(0.05)
+            with UntrustedFolder(self.folder) as folder:
+                poses = poses_state(folder)
+                names = self._checkpoint_files(folder, stage)
+            if poses is None:
+                continue
             if not names:
                 return None
             try:
@@ -282,10 +271,16 @@ class Workspace:
                 with UntrustedFolder(self.folder) as folder:
                     if all(name in self.stored_frames or folder.is_file(name) for name in names):
                         raise
-                time.sleep(0.05)
                 continue
-            return Checkpoint(self._job.attempt, stage, step, files)
+            with UntrustedFolder(self.folder) as folder:
+                if poses == poses_state(folder):
+                    return Checkpoint(self._job.attempt, stage, step, files)
         return None
+
+    def _checkpoint_files(self, folder: UntrustedFolder, stage: str) -> list[str]:
+        if stage == "render":
+            return self.stored_frames.checkpoint_names()
+        return checkpoint_files(folder, stage, self._own_block)
 
     def store_results(self) -> Manifest:
         """Store the results without publishing them."""
@@ -342,55 +337,6 @@ class Workspace:
         files = {file.path: file for file in store_tree(self.storage, self.folder, new).files}
         self.stored_frames.add(files.values())
         return tuple(files[name] if name in files else self.stored_frames[name] for name in names)
-
-    def _checkpoint_files(self, stage: str) -> list[str]:
-        if stage == "render":
-            return self.stored_frames.checkpoint_names()
-        with UntrustedFolder(self.folder) as folder:
-            names = [name for name in _CHECKPOINT_FILES if folder.is_file(name)]
-            found = f"{RUN_FOLDER}/{POSES_FOLDER}"  # further models lie in folders below
-            poses = sorted(f"{found}/{name}" for name in folder.names(found))
-            checkpoints = _directly_below(folder, f"{RUN_FOLDER}/checkpoints")
-            pieces = list(_piece_files(folder, self._own_block))
-            search = [name for name in _SEARCH_FILES if folder.is_file(name)]
-        if self._own_block is not None:  # all else is the whole job's
-            return pieces
-        names += [*poses, *pieces]
-        if "run/scene.ply" in names:  # the training is done, its checkpoints are of no more use
-            return [name for name in names if not name.endswith(".npz")]
-        newest = max((name for name in checkpoints if _CHECKPOINT.fullmatch(name)), default=None)
-        if newest is not None:
-            return [*names, newest]
-        if search and not poses:
-            # The first of two searches may have ended, whose state an earlier checkpoint has.
-            is_new = stage != "poses" or any(name.endswith(STORED_MAPPINGS) for name in search)
-            has_state = is_new and any(name.endswith(STORED_DATABASE) for name in search)
-            return [*names, *search] if has_state else []
-        return names if poses or pieces else []
-
-
-def _piece_files(folder: UntrustedFolder, own_block: str | None) -> Iterator[str]:
-    """Yield the files of a run in blocks from which an attempt goes on, the newest checkpoint of each piece.
-
-    Args:
-        folder: of the attempt.
-        own_block: the block of its job; None for the whole, which goes without those of its blocks.
-    """
-    newest: dict[str, str] = {}
-    for name in sorted(folder.names(_BLOCKS)):
-        piece, _, rest = name.partition("/")
-        if (piece != own_block) if own_block is not None else _BLOCK.fullmatch(piece):
-            continue
-        if not rest or rest in ("best.npz", "piece.json"):
-            yield f"{_BLOCKS}/{name}"
-        elif re.fullmatch(r"checkpoints/(iteration_\d+|best)\.npz", rest):
-            newest[f"{piece}/{'best' if rest.endswith('best.npz') else 'iteration'}"] = name
-    yield from (f"{_BLOCKS}/{name}" for name in newest.values())
-
-
-def _directly_below(folder: UntrustedFolder, below: str) -> list[str]:
-    """Return the names, relative to ``folder``, of the files of one of its folders."""
-    return [f"{below}/{name}" for name in folder.names(below) if "/" not in name]
 
 
 def _tree_files(files: Sequence[DatasetFile]) -> list[TreeFile]:
