@@ -41,6 +41,7 @@ def reconstruct(
     blocks: BlockRequest | None = None,
     start_from: Path | None = None,
     steps: Sequence[Step] = RESULT_STEPS,
+    given: tuple[str, ...] | None = None,
 ) -> Path:
     """Reconstruct ``scene`` into the folder ``output`` and return it.
 
@@ -63,6 +64,9 @@ def reconstruct(
             points; None, with ``resume``, goes on as the run was begun.
         blocks: how to train in blocks; None trains the scene as a whole or, with ``resume``, as it was begun.
         steps: what is done once the photographs are open, where that is only a part of the run.
+        given: names of the settings that somebody asked for, see
+            :func:`octasplat.engine.runs.config.given_settings`, which a run keeps that was to learn materials
+            and does not; None where that is not known or, with ``resume``, takes those of the run.
 
     Raises:
         DatasetError: the photographs or the model cannot be used, or no poses be found.
@@ -85,9 +89,10 @@ def reconstruct(
         require_blocks_possible(config)
     use_threads(threads)
     config, found_by = config.without_run_of_model()
-    config = with_recorded_choice(output, config)
+    if resume:
+        config, given = with_recorded_choice(output, config, given)
     # before the claim, which makes the folder
-    is_made, is_new = not output.exists(), claim_output(scene, output, config, resume)
+    is_made, is_new = not output.exists(), claim_output(scene, output, config, resume, given=given)
     with lock_run_folder(output):
         with release_on_refusal(output, is_new=is_new, is_made=is_made):
             blocks = keep_request(output, blocks, is_new=is_new)
@@ -98,6 +103,7 @@ def reconstruct(
                 scene=scene,
                 output=output,
                 config=config,
+                given=given,
                 threads=threads,
                 progress=progress,
                 should_stop=should_stop,
