@@ -29,6 +29,7 @@ from octasplat.engine.runs.run_poses import (
     estimate_principal_points,
     find_missing_poses,
     repair_run_poses,
+    tell_of_former_poses,
     warn_of_other_models,
 )
 from octasplat.engine.train.sampling.batches import BatchOptions, BatchSource
@@ -61,6 +62,7 @@ class FindPoses:
             should_stop=run.should_stop,
         )
         if run.recorded is None:
+            tell_of_former_poses(run.output, run.progress)
             warn_of_other_models(run.output, run.progress)
 
 

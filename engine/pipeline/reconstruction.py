@@ -19,9 +19,9 @@ from octasplat.engine.pipeline.result_steps import EvaluateStep, ExportStep
 from octasplat.engine.pipeline.run import OnStep, ReconstructionRun, Step, run_steps
 from octasplat.engine.pipeline.run_lock import lock_run_folder
 from octasplat.engine.pipeline.start_scene import keep_found_models, keep_start
-from octasplat.engine.pipeline.train_step import TrainStep
+from octasplat.engine.pipeline.train_step import TrainStep, tell_of_former_scene
 from octasplat.engine.runs.config import ReconstructionConfig
-from octasplat.engine.runs.run_folder import CACHE, EVENTS, SCENE, VIEWS
+from octasplat.engine.runs.run_folder import CACHE, EVENTS, METRICS, REPORT, SCENE, VIEWS
 
 DATASET_STEPS = (FindPoses(), OpenDataset())
 """The steps that may refuse the photographs or the settings."""
@@ -130,6 +130,8 @@ def _run_all_steps(run: ReconstructionRun, steps: Sequence[Step], *, is_new: boo
     try:
         with release_on_refusal(output, is_new=is_new, is_made=is_made):
             run_steps(_steps_before(steps), run)
+        if not all((output / name).exists() for name in (METRICS, REPORT, *run.config.exports)):
+            tell_of_former_scene(run)
         run_steps(steps, run)
         run.dataset.release_pages()
         if steps is RESULT_STEPS:

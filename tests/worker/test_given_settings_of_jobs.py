@@ -19,6 +19,7 @@ __all__ = ["connect_service"]
 
 pytestmark = pytest.mark.heavy
 
+MAX_WAIT_SECONDS = 1200.0
 TRAIN = {"iterations": 2, "initial_points": 50, "max_gaussians": 100}
 PLAIN: dict[str, Any] = {"preset": "fast", "train": TRAIN, "test_every": 4, "exports": []}
 
@@ -41,7 +42,7 @@ async def test_job_without_its_materials_has_the_bytes_of_a_run_without_them(
                 answer = await http.post("/v1/jobs", json=body)
                 assert answer.status_code == 202, answer.text
                 job = uuid.UUID(answer.json()["id"])
-                done = await asyncio.to_thread(bench.wait_until_finished, job)
+                done = await asyncio.to_thread(bench.wait_until_finished, job, MAX_WAIT_SECONDS)
                 assert done.state == "succeeded", bench.worker_logs()
                 results = await asyncio.to_thread(bench.results, job)
                 assert json.loads(results["config.json"])["material_choice"] == "none"

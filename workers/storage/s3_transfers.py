@@ -60,10 +60,11 @@ class S3Writer(VerifyingWriter):
                 Key=self._key,
                 UploadId=self._upload,
                 PartNumber=number,
-                Body=bytes(self._buffer),
+                Body=self._buffer,
             )
         self._parts.append({"ETag": answer["ETag"], "PartNumber": number})
-        self._buffer.clear()
+        # A new one, as the client may still look at what it has sent.
+        self._buffer = bytearray()
 
     def _publish(self, blob: Blob) -> None:
         bucket = self._bucket
@@ -71,7 +72,7 @@ class S3Writer(VerifyingWriter):
         # Less than one part, and nothing was sent yet: one request does it.
         if self._upload is None:
             with bucket.translate_errors(final_key):
-                bucket.client.put_object(Bucket=bucket.bucket, Key=final_key, Body=bytes(self._buffer))
+                bucket.client.put_object(Bucket=bucket.bucket, Key=final_key, Body=self._buffer)
             return
         if self._buffer:
             self._send_part()
