@@ -60,11 +60,10 @@ class S3Writer(VerifyingWriter):
                 Key=self._key,
                 UploadId=self._upload,
                 PartNumber=number,
-                Body=self._buffer,
+                Body=bytes(self._buffer),
             )
         self._parts.append({"ETag": answer["ETag"], "PartNumber": number})
-        # A new one, as the client may still look at what it has sent.
-        self._buffer = bytearray()
+        self._buffer.clear()
 
     def _publish(self, blob: Blob) -> None:
         bucket = self._bucket
@@ -72,7 +71,7 @@ class S3Writer(VerifyingWriter):
         # Less than one part, and nothing was sent yet: one request does it.
         if self._upload is None:
             with bucket.translate_errors(final_key):
-                bucket.client.put_object(Bucket=bucket.bucket, Key=final_key, Body=self._buffer)
+                bucket.client.put_object(Bucket=bucket.bucket, Key=final_key, Body=bytes(self._buffer))
             return
         if self._buffer:
             self._send_part()
