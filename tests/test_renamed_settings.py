@@ -13,12 +13,8 @@ import octasplat as osp
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.operations.reconstruct import ReconstructOptions, ReconstructRequest, run_config
 from octasplat.engine.operations.registry import operations
-from octasplat.engine.runs.config import (
-    ReconstructionConfig,
-    former_setting_names,
-    read_config,
-    resolve_config,
-)
+from octasplat.engine.runs.config import ReconstructionConfig, read_config, resolve_config
+from octasplat.engine.runs.setting_names import former_setting_names
 from octasplat.engine.runs.settings_catalog import find_setting
 from octasplat.engine.settings.base import dump_with_former_settings
 from octasplat.engine.settings.renamed_settings import (

@@ -7,7 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from octasplat.engine.core.events import EventListener
+from octasplat.engine.core import versions
+from octasplat.engine.core.events import EventListener, Warned
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.dataset.camera_clearance import CameraClearance, camera_clearances
@@ -74,13 +75,19 @@ class Piece:
 
 
 def is_piece_done(work: BlockWork, name: str) -> bool:
-    """Return whether the result of a piece exists."""
-    return (work.folder / name / RESULT).exists()
+    """Return whether the result of a piece exists, of a version that has the results of this one."""
+    folder = work.folder / name
+    return (folder / RESULT).exists() and versions.has_same_results(_read_record(folder))
 
 
 def piece_record(work: BlockWork, name: str) -> dict[str, float]:
     """Return the iterations, seconds and Gaussians of a piece; nothing where it was not trained."""
-    path = work.folder / name / RECORD
+    record = _read_record(work.folder / name)
+    return {key: value for key, value in record.items() if key != versions.STATED}
+
+
+def _read_record(folder: Path) -> dict[str, float]:
+    path = folder / RECORD
     record: dict[str, float] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     return record
 
@@ -88,7 +95,8 @@ def piece_record(work: BlockWork, name: str) -> dict[str, float]:
 def train_piece(work: BlockWork, piece: Piece, progress: EventListener) -> BestState:
     """Train a piece, go on with its training, or return what it came to.
 
-    Its checkpoints are removed when it is done, so that only those of one piece lie on the disk.
+    Its checkpoints are removed when it is done, so that only those of one piece lie on the disk. What is of a
+    version with other results is trained anew.
 
     Args:
         work: what all pieces share.
@@ -103,6 +111,14 @@ def train_piece(work: BlockWork, piece: Piece, progress: EventListener) -> BestS
     folder = work.folder / piece.name
     if is_piece_done(work, piece.name):
         return load_best(folder)
+    if (folder / RESULT).exists():
+        work.progress(
+            Warned(
+                f"{folder} was trained by a version in which the same settings gave other results, so it is "
+                "trained anew."
+            )
+        )
+        (folder / RESULT).unlink()
     checkpoints, config = folder / CHECKPOINTS, piece.config
     identity = f"{run_fingerprint(work.dataset, config)} {piece.name}"
     fingerprint = hashlib.sha256(identity.encode()).hexdigest()
@@ -133,6 +149,7 @@ def train_piece(work: BlockWork, piece: Piece, progress: EventListener) -> BestS
         "seconds": trainer.state.seconds,
         "gaussians": len(gaussians),
         "taken_near": trainer.state.pruned_near_cameras,
+        versions.STATED: versions.RESULTS_VERSION,
     }
     write_json(folder / RECORD, record)
     result = BestState(gaussians, trainer.shading.state())

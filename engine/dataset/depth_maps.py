@@ -27,6 +27,7 @@ import numpy as np
 import OpenImageIO as oiio
 from jaxtyping import Bool, Float32, Float64, Int64
 
+from octasplat.engine.core import versions
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.read_ahead import read_ahead
 from octasplat.engine.core.relative_paths import normalize_name
@@ -329,6 +330,7 @@ class _Index(TypedDict):
     sizes_px: list[list[int]]
     are_integers: list[bool]
     have_depths: list[bool]
+    results: int
 
 
 def _read_index(folder: Path, digest: str, have_maps: Sequence[bool]) -> _Index | None:
@@ -340,6 +342,7 @@ def _read_index(folder: Path, digest: str, have_maps: Sequence[bool]) -> _Index 
     except (OSError, ValueError, KeyError, TypeError):
         return None
     is_same = index.get("version") == CACHE_VERSION and index.get("digest") == digest
+    is_same = is_same and versions.has_same_results(index)
     # the digest does not know of views without a map
     is_same = is_same and [width > 0 for width, _ in index["sizes_px"]] == list(have_maps)
     return index if is_whole and is_same else None
@@ -377,7 +380,7 @@ def _decode(
             file.write(depth.tobytes())
     index: _Index = {
         "version": CACHE_VERSION, "digest": digest, "sizes_px": sizes_px, "are_integers": are_integers,
-        "have_depths": have_depths,
+        "have_depths": have_depths, "results": versions.RESULTS_VERSION,
     }  # fmt: skip
     write_json(folder / _INDEX, index)
     return index

@@ -4,7 +4,8 @@
 is deeper, uint16; ``alpha.bin`` and ``mask.bin`` hold one byte per pixel and exist only where
 needed.
 ``pixels.json`` says from which files they were made: by digests of their contents, and by a stamp of their
-folder, sizes and times, which spares reading them again.
+folder, sizes and times, which spares reading them again. What a version with other results has decoded is
+decoded again.
 """
 
 import hashlib
@@ -20,6 +21,7 @@ from typing import TypedDict
 import numpy as np
 from jaxtyping import Int64
 
+from octasplat.engine.core import versions
 from octasplat.engine.core.errors import DatasetError, DiskFullError, OutputError
 from octasplat.engine.core.writing import atomic_replace, write_json
 from octasplat.engine.dataset.image_info import ImageInfo, Storage
@@ -161,8 +163,18 @@ def open_pixel_cache(
     )
 
 
+def has_former_cache(folder: Path) -> bool:
+    """Return whether the pixels in a folder are of a version with other results, and so decoded again."""
+    try:
+        index = json.loads((folder / "pixels.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(index, dict) and not versions.has_same_results(index)
+
+
 class _Index(TypedDict):
     version: int
+    results: int
     stamp: str
     digests: list[tuple[str, str | None]]
     sizes_px: list[list[int]]
@@ -210,13 +222,14 @@ def file_sha256(path: Path) -> str:
 
 
 def _read_index(folder: Path, pixels: int) -> _Index | None:
-    """Return the index if its version and the sizes of its files are as expected; else None."""
+    """Return the index if its versions and the sizes of its files are as expected; else None."""
     try:
         index: _Index = json.loads((folder / "pixels.json").read_text(encoding="utf-8"))
         expected = {"rgb.bin": 3 * pixels * index["bits"] // 8}
         expected |= {f"{name}.bin": pixels for name in ("alpha", "mask") if index[name]}
         is_complete = all((folder / name).stat().st_size == size for name, size in expected.items())
-        return index if is_complete and index["version"] == CACHE_VERSION else None
+        is_current = index["version"] == CACHE_VERSION and versions.has_same_results(index)
+        return index if is_complete and is_current else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
@@ -269,6 +282,7 @@ def _build_cache(
         warnings += check_masks(masks, len(model.views))
     index: _Index = {
         "version": CACHE_VERSION,
+        "results": versions.RESULTS_VERSION,
         "stamp": stamp,
         "digests": [(each.digests.photograph, each.digests.mask) for each in summaries],
         "sizes_px": [[view.width_px, view.height_px] for view in model.views],

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from octasplat.engine.core import versions
 from octasplat.engine.core.errors import OutputError
 from octasplat.engine.core.writing import atomic_replace, write_text
 from octasplat.engine.dataset.camera import ROUND_TRIP_TOLERANCE_PX, Camera
@@ -116,7 +117,8 @@ def has_rays_everywhere(camera: Camera) -> bool:
 
 def _index_text(cameras: Sequence[Camera]) -> str:
     listed = [[camera.model, list(camera.params), camera.width_px, camera.height_px] for camera in cameras]
-    return json.dumps({"tolerance_px": ROUND_TRIP_TOLERANCE_PX, "cameras": listed}) + "\n"
+    of_version = {"tolerance_px": ROUND_TRIP_TOLERANCE_PX, versions.STATED: versions.RESULTS_VERSION}
+    return json.dumps({**of_version, "cameras": listed}) + "\n"
 
 
 def _is_up_to_date(table: Path, index_file: Path, index_text: str, size: int) -> bool:

@@ -107,6 +107,21 @@ class PlainReconstructOptions(RunSettings, Options):
         )
         return {**requested, "for_surface": True} if self.for_surface else requested
 
+    def given(self) -> tuple[str, ...]:
+        """Return the names, with dots, of the settings that the options give, whatever their values.
+
+        Raises:
+            InvalidSettingsError: a setting is unknown.
+        """
+        from octasplat.engine.runs.config import given_settings
+
+        return given_settings(
+            {name: getattr(self, name) for name in RunSettings.model_fields if name in self.model_fields_set},
+            materials=self.materials if "materials" in self.model_fields_set else None,
+            train=self._nested_train_settings(),
+            assignments=self.assignments,
+        )
+
     def revised(self, before: Mapping[str, Any]) -> "ReconstructionConfig":
         """Return a complete configuration, given as JSON, overridden by the options that were given.
 
@@ -233,18 +248,23 @@ def run_config(request: ReconstructRequest) -> "ReconstructionConfig":
     """
     from octasplat.engine.runs.config import read_config
 
+    if not _takes_own_settings(request):
+        return request.config()
+    config = read_config(request.output / _CONFIG)
+    if "exports" in request.model_fields_set:
+        config = config.model_copy(update={"exports": request.exports})
+    return config
+
+
+def _takes_own_settings(request: ReconstructRequest) -> bool:
+    """Return whether a request goes on with a run by the run's own settings."""
     # with options the request's configuration counts, and is checked against the run's
     given = request.model_fields_set - {
         *("source", "output", "resume", "exports", "frames_per_second", "blocks", "memory", "start_from")
     }  # fmt: skip
     # empty ones say nothing, whoever filled them in
     given -= {name for name in ("train", "assignments") if not getattr(request, name)}
-    if not request.resume or given or not (request.output / _CONFIG).exists():
-        return request.config()
-    config = read_config(request.output / _CONFIG)
-    if "exports" in request.model_fields_set:
-        config = config.model_copy(update={"exports": request.exports})
-    return config
+    return request.resume and not given and (request.output / _CONFIG).exists()
 
 
 def scene_folder(request: ReconstructRequest) -> Path:
@@ -317,6 +337,7 @@ def run(
         on_step=on_step,
         blocks=blocks,
         start_from=request.start_from,
+        given=None if _takes_own_settings(request) else request.given(),
     )
     return finished_result(output, config.exports)
 

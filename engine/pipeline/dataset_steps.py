@@ -10,8 +10,7 @@ from octasplat.engine.dataset import Dataset, write_held_out
 from octasplat.engine.dataset.views_file import write_views
 from octasplat.engine.georeference.find_georeference import find_georeference
 from octasplat.engine.georeference.request import read_request
-from octasplat.engine.pipeline.material_choice import CHOICE_KEY, recorded_choice
-from octasplat.engine.pipeline.output_folder import write_config
+from octasplat.engine.pipeline.material_choice import rewrite_config
 from octasplat.engine.pipeline.run import ReconstructionRun, run_steps
 from octasplat.engine.pipeline.start_scene import check_start, has_start
 from octasplat.engine.poses.photographs import notes_on_files
@@ -30,6 +29,7 @@ from octasplat.engine.runs.run_poses import (
     estimate_principal_points,
     find_missing_poses,
     repair_run_poses,
+    tell_of_former_poses,
     warn_of_other_models,
 )
 from octasplat.engine.train.sampling.batches import BatchOptions, BatchSource
@@ -62,6 +62,7 @@ class FindPoses:
             should_stop=run.should_stop,
         )
         if run.recorded is None:
+            tell_of_former_poses(run.output, run.progress)
             warn_of_other_models(run.output, run.progress)
 
 
@@ -128,8 +129,7 @@ def _note_folder(run: ReconstructionRun) -> None:
     """Write where the photographs are, if they have moved, and which files are wanted, if others are."""
     output = run.output
     if dataset_folder_of_run(output) != run.scene.resolve() or read_config(output / CONFIG) != run.config:
-        choice = recorded_choice(output)
-        write_config(run.scene, output, run.config, {} if choice is None else {CHOICE_KEY: choice})
+        rewrite_config(run)
 
 
 def _repair_poses(run: ReconstructionRun) -> None:

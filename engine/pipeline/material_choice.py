@@ -1,15 +1,17 @@
 """Whether a run learns materials, and by which recipe: chosen by short trainings before a long one."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, get_args
 
 from octasplat.engine.core.events import Noted, Warned
-from octasplat.engine.pipeline.output_folder import write_config
+from octasplat.engine.pipeline.output_folder import other_settings_error, write_config
 from octasplat.engine.pipeline.run import ReconstructionRun
 from octasplat.engine.pipeline.start_scene import has_start
-from octasplat.engine.runs.config import ReconstructionConfig, revise_config
+from octasplat.engine.runs.config import ReconstructionConfig, read_given, revise_config
 from octasplat.engine.runs.run_folder import CONFIG
+from octasplat.engine.settings.refusals import InvalidSettingsError
 from octasplat.engine.shading.material_settings import Recipe
 from octasplat.engine.train.config import iteration_count
 from octasplat.engine.train.loop.trial_training import MATERIAL_TRIAL_RAYS, material_gain_db
@@ -29,8 +31,19 @@ MAX_WHOLE_LOSS_DB = 0.3
 ``near_field`` loses, too."""
 
 
-def apply_choice(config: ReconstructionConfig, choice: MaterialChoice) -> ReconstructionConfig:
+def apply_choice(
+    config: ReconstructionConfig, choice: MaterialChoice, given: Sequence[str] | None = None
+) -> ReconstructionConfig:
     """Return the settings of a run that asked for materials, with what was chosen.
+
+    Args:
+        config: the settings.
+        choice: what was chosen.
+        given: names of the settings that were given, which stay without materials; None keeps those that
+            differ from the settings of the preset with materials.
+
+    Raises:
+        InvalidSettingsError: what was given cannot be used without materials.
 
     Example:
         >>> from octasplat.engine.runs.config import resolve_config
@@ -38,23 +51,45 @@ def apply_choice(config: ReconstructionConfig, choice: MaterialChoice) -> Recons
         'near_field'
         >>> apply_choice(resolve_config("fast", materials=True), "none") == resolve_config("fast")
         True
+        >>> few_rays = resolve_config("fast", materials=True, assignments=["rays_per_batch=8192"])
+        >>> apply_choice(few_rays, "none", ["rays_per_batch"]).train.rays_per_batch
+        8192
     """
     before = config.model_dump(mode="json")
     if choice != "none":
         return revise_config(before, train={"materials": {"recipe": choice}})
     # edges are a term of materials alone, which would be refused
-    return revise_config(before, materials=False, train={"loss": {"edges": None}})
+    return revise_config(before, materials=False, train={"loss": {"edges": None}}, given=given)
 
 
-def with_recorded_choice(output: Path, config: ReconstructionConfig) -> ReconstructionConfig:
+def with_recorded_choice(
+    output: Path, config: ReconstructionConfig, given: tuple[str, ...] | None = None
+) -> tuple[ReconstructionConfig, tuple[str, ...] | None]:
     """Return the settings of a command with what the run in a folder has chosen, if it is there and has.
 
     Args:
         output: the folder.
         config: as the command gives it; the run's own settings have the choice already.
+        given: names of the settings that the command gives; None where it goes on by those of the run, or
+            where that is not known.
+
+    Returns:
+        The settings, and the names of those that were given: by the run, if it is there.
+
+    Raises:
+        ConfigError: the run was given other settings, so that without materials it would be another one.
     """
-    choice = recorded_choice(output)
-    return apply_choice(config, choice) if choice is not None and _asks_for_choice(config) else config
+    if not (output / CONFIG).exists():
+        return config, given
+    recorded = read_given(output / CONFIG)
+    if _asks_for_choice(config):
+        # a run of old does not know what it was given, and goes on as it was begun
+        of_command = recorded if given is None or recorded is None else given
+        if (choice := recorded_choice(output)) is not None:
+            config = apply_choice(config, choice, of_command)
+        elif _without_materials(config, of_command) != _without_materials(config, recorded):
+            raise other_settings_error(output)
+    return config, recorded
 
 
 def recorded_choice(output: Path) -> MaterialChoice | None:
@@ -86,7 +121,10 @@ def choose_materials(run: ReconstructionRun) -> None:
     run.progress(Noted("Two short trainings show first whether materials explain these photographs."))
     gain_db = _trial_gain_db(run, config.materials.recipe)
     is_chosen = _asks_for_choice(run.config) and not has_start(run.output)
-    is_whole = not (run.dataset.has_alpha or run.dataset.has_masks)
+    # What was given may be possible with materials only.
+    is_whole = not (run.dataset.has_alpha or run.dataset.has_masks) and (
+        not is_chosen or _without_materials(run.config, run.given) is not None
+    )
     if gain_db >= -(MAX_WHOLE_LOSS_DB if is_whole and is_chosen else MAX_MATERIAL_LOSS_DB):
         if is_chosen:
             _record(run, "split_sum")
@@ -106,12 +144,12 @@ def choose_materials(run: ReconstructionRun) -> None:
             _record(run, "near_field")
             return
         if is_whole:
+            but = "" if run.given is not None else " that differs from those with materials"
             run.progress(
                 Warned(
                     f"{loss}: little here reflects its surroundings clearly. The scene is trained without "
-                    "materials, with the settings of its preset for that where none was given that differs "
-                    "from those with materials; --set materials.fallback=false learns them all the same, for "
-                    "a scene that is to be lit anew."
+                    f"materials, with the settings of its preset for that where none was given{but}; --set "
+                    "materials.fallback=false learns them all the same, for a scene that is to be lit anew."
                 )
             )
             _record(run, "none")
@@ -135,6 +173,16 @@ def _asks_for_choice(config: ReconstructionConfig) -> bool:
     return materials.learn and materials.recipe == "split_sum" and materials.fallback is not False
 
 
+def _without_materials(
+    config: ReconstructionConfig, given: Sequence[str] | None
+) -> ReconstructionConfig | None:
+    """Return the settings of the training without materials; None where there can be none."""
+    try:
+        return apply_choice(config, "none", given)
+    except InvalidSettingsError:
+        return None
+
+
 def _trial_gain_db(run: ReconstructionRun, recipe: Recipe) -> float:
     return material_gain_db(
         run.dataset,
@@ -148,5 +196,12 @@ def _trial_gain_db(run: ReconstructionRun, recipe: Recipe) -> float:
 
 def _record(run: ReconstructionRun, choice: MaterialChoice) -> None:
     """Keep a choice in the run's settings and in ``config.json``, for this process and later ones."""
-    run.config = apply_choice(run.config, choice)
-    write_config(run.scene, run.output, run.config, {CHOICE_KEY: choice})
+    run.config = apply_choice(run.config, choice, run.given)
+    rewrite_config(run, choice)
+
+
+def rewrite_config(run: ReconstructionRun, choice: MaterialChoice | None = None) -> None:
+    """Write ``config.json`` anew, with what the run has chosen by now or before."""
+    choice = choice or recorded_choice(run.output)
+    decided = {} if choice is None else {CHOICE_KEY: choice}
+    write_config(run.scene, run.output, run.config, given=run.given, decided=decided)

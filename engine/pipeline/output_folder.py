@@ -1,7 +1,7 @@
 """The folder of a run: claimed before the work, and released if the work is refused."""
 
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -19,12 +19,26 @@ from octasplat.engine.core.versions import package_versions
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset.model_sources import has_model
 from octasplat.engine.poses.found_models import read_pose_record
-from octasplat.engine.runs.config import ReconstructionConfig, read_config
+from octasplat.engine.runs.config import GIVEN, ReconstructionConfig, read_config
 from octasplat.engine.runs.run_folder import BLOCKS, CACHE, CONFIG, EVENTS, POSES, START
 
 
-def claim_output(scene: Path, output: Path, config: ReconstructionConfig, resume: bool) -> bool:
+def claim_output(
+    scene: Path,
+    output: Path,
+    config: ReconstructionConfig,
+    resume: bool,
+    *,
+    given: Sequence[str] | None = None,
+) -> bool:
     """Create the folder and its ``config.json``, or check that it is the run to resume.
+
+    Args:
+        scene: folder of the photographs.
+        output: the folder.
+        config: all settings.
+        resume: whether it may be a run that is there.
+        given: names of the settings that a new run was given; None where that is not known.
 
     Returns:
         Whether the run is new.
@@ -52,7 +66,7 @@ def claim_output(scene: Path, output: Path, config: ReconstructionConfig, resume
         output.mkdir(parents=True, exist_ok=True)
         for left in output.glob(".*.partial.*"):  # by a run that was killed while it wrote
             left.unlink()
-        write_config(scene, output, config)
+        write_config(scene, output, config, given=given)
     except OSError as error:
         raise OutputError(
             f"{output} cannot be written to ({error.strerror or error}); name another folder."
@@ -109,7 +123,12 @@ def _is_from_pose_search(poses: Path) -> bool:
 
 
 def write_config(
-    scene: Path, output: Path, config: ReconstructionConfig, decided: Mapping[str, str] | None = None
+    scene: Path,
+    output: Path,
+    config: ReconstructionConfig,
+    *,
+    given: Sequence[str] | None,
+    decided: Mapping[str, str] | None = None,
 ) -> None:
     """Write ``config.json``: the photographs' place, all settings, and the versions of the software.
 
@@ -117,11 +136,14 @@ def write_config(
         scene: folder of the photographs.
         output: the folder.
         config: all settings.
+        given: names of those that were given, see :func:`octasplat.engine.runs.config.given_settings`; None
+            where that is not known.
         decided: what the run has decided by itself, by name.
     """
     content = {
         "scene": str(scene.resolve()),
         "reconstruction": config.model_dump(mode="json"),
+        **({} if given is None else {GIVEN: list(given)}),
         "versions": package_versions(),
         **(decided or {}),
     }
@@ -133,10 +155,15 @@ def _check_settings(scene: Path, output: Path, config: ReconstructionConfig) -> 
     is_posed = has_model(scene)
     before = read_config(output / CONFIG).model_copy(update={"exports": config.exports})
     if _normalize_config(before, is_posed) != _normalize_config(config, is_posed):
-        raise ConfigError(
-            f"{output / CONFIG} has other settings than this command; repeat the settings of the run, "
-            "or name another folder."
-        )
+        raise other_settings_error(output)
+
+
+def other_settings_error(output: Path) -> ConfigError:
+    """Return what to say of a command whose settings are not those of the run in a folder."""
+    return ConfigError(
+        f"{output / CONFIG} has other settings than this command; repeat the settings of the run, or name "
+        "another folder."
+    )
 
 
 def _normalize_config(config: ReconstructionConfig, is_posed: bool) -> ReconstructionConfig:

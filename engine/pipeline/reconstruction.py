@@ -20,9 +20,9 @@ from octasplat.engine.pipeline.result_steps import EvaluateStep, ExportStep
 from octasplat.engine.pipeline.run import OnStep, ReconstructionRun, Step, run_steps
 from octasplat.engine.pipeline.run_lock import lock_run_folder
 from octasplat.engine.pipeline.start_scene import keep_found_models, keep_start
-from octasplat.engine.pipeline.train_step import TrainStep
+from octasplat.engine.pipeline.train_step import TrainStep, tell_of_former_scene
 from octasplat.engine.runs.config import ReconstructionConfig
-from octasplat.engine.runs.run_folder import CACHE, EVENTS, POSES, SCENE, VIEWS
+from octasplat.engine.runs.run_folder import CACHE, EVENTS, METRICS, POSES, REPORT, SCENE, VIEWS
 
 DATASET_STEPS = (FindPoses(), OpenDataset())
 """The steps that may refuse the photographs or the settings."""
@@ -42,6 +42,7 @@ def reconstruct(
     blocks: BlockRequest | None = None,
     start_from: Path | None = None,
     steps: Sequence[Step] = RESULT_STEPS,
+    given: tuple[str, ...] | None = None,
 ) -> Path:
     """Reconstruct ``scene`` into the folder ``output`` and return it.
 
@@ -64,6 +65,9 @@ def reconstruct(
             points; None, with ``resume``, goes on as the run was begun.
         blocks: how to train in blocks; None trains the scene as a whole or, with ``resume``, as it was begun.
         steps: what is done once the photographs are open, where that is only a part of the run.
+        given: names of the settings that somebody asked for, see
+            :func:`octasplat.engine.runs.config.given_settings`, which a run keeps that was to learn materials
+            and does not; None where that is not known or, with ``resume``, takes those of the run.
 
     Raises:
         DatasetError: the photographs or the model cannot be used, or no poses be found.
@@ -86,9 +90,10 @@ def reconstruct(
         require_blocks_possible(config)
     use_threads(threads)
     config, found_by = config.without_run_of_model()
-    config = with_recorded_choice(output, config)
+    if resume:
+        config, given = with_recorded_choice(output, config, given)
     # before the claim, which makes the folder
-    is_made, is_new = not output.exists(), claim_output(scene, output, config, resume)
+    is_made, is_new = not output.exists(), claim_output(scene, output, config, resume, given=given)
     with lock_run_folder(output):
         restore_folder(output / POSES)  # before anything looks for poses, which might be found or copied anew
         with release_on_refusal(output, is_new=is_new, is_made=is_made):
@@ -100,6 +105,7 @@ def reconstruct(
                 scene=scene,
                 output=output,
                 config=config,
+                given=given,
                 threads=threads,
                 progress=progress,
                 should_stop=should_stop,
@@ -126,6 +132,8 @@ def _run_all_steps(run: ReconstructionRun, steps: Sequence[Step], *, is_new: boo
     try:
         with release_on_refusal(output, is_new=is_new, is_made=is_made):
             run_steps(_steps_before(steps), run)
+        if not all((output / name).exists() for name in (METRICS, REPORT, *run.config.exports)):
+            tell_of_former_scene(run)
         run_steps(steps, run)
         run.dataset.release_pages()
         if steps is RESULT_STEPS:

@@ -38,6 +38,8 @@ class ReconstructionRun:
         blocks: how to train in blocks; None trains the scene as a whole.
         check_views: called with the photographs that were found, before decoding; raises to reject them.
         georeference: what the georeference of a new run is found from.
+        given: names of the settings that were given, see
+            :func:`octasplat.engine.runs.config.given_settings`; None where that is not known.
     """
 
     scene: Path
@@ -51,6 +53,7 @@ class ReconstructionRun:
     blocks: BlockRequest | None = None
     check_views: Callable[[ViewsRecord], None] | None = None
     georeference: GeoreferenceRequest | None = None
+    given: tuple[str, ...] | None = None
     _dataset: Dataset | None = None
 
     @property

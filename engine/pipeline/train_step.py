@@ -1,11 +1,14 @@
 """The training step: its result is the scene, and what the training learnt beside it."""
 
+import json
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
 
+from octasplat.engine.core import versions
 from octasplat.engine.core.events import EventListener, Noted, Warned
 from octasplat.engine.core.progress import PhaseClock, phase
 from octasplat.engine.core.threads import use_threads
@@ -20,7 +23,7 @@ from octasplat.engine.gaussians.materials import reflective_fraction
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.scene_metadata import SceneMetadata
 from octasplat.engine.pipeline.block_steps import count_blocks, train_all_blocks
-from octasplat.engine.pipeline.material_choice import choose_materials
+from octasplat.engine.pipeline.material_choice import choose_materials, rewrite_config
 from octasplat.engine.pipeline.run import ReconstructionRun
 from octasplat.engine.pipeline.start_scene import has_start, started_state
 from octasplat.engine.render.environment_files import write_background_map, write_environment
@@ -40,7 +43,11 @@ from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.shading.recipes import material_shading
 from octasplat.engine.train.config import TrainConfig, iteration_count
 from octasplat.engine.train.initialization.initial_gaussians import initial_train_state
-from octasplat.engine.train.loop.checkpoint import load_latest_checkpoint, run_fingerprint
+from octasplat.engine.train.loop.checkpoint import (
+    load_latest_checkpoint,
+    remove_former_checkpoints,
+    run_fingerprint,
+)
 from octasplat.engine.train.loop.state import MinScale, TrainState
 from octasplat.engine.train.loop.time_budget import make_plan, read_plan, write_plan
 from octasplat.engine.train.loop.trainer import Trainer
@@ -50,6 +57,20 @@ from octasplat.engine.train.views.exposure_changes import resolve_exposure
 
 MIN_REFLECTIVE_SHARE = 0.01
 """Share of the surface that must reflect for materials and the environment to be more than guesses."""
+
+
+def tell_of_former_scene(run: ReconstructionRun) -> None:
+    """Tell where the scene of a run that goes on was trained by a version with other results."""
+    record: object = {}
+    with suppress(OSError, ValueError):  # as of a run of old
+        record = json.loads((run.output / TRAINING).read_text(encoding="utf-8"))
+    if (run.output / SCENE).exists() and isinstance(record, dict) and not versions.has_same_results(record):
+        run.progress(
+            Warned(
+                f"{run.output / SCENE} was trained by a version in which the same settings gave other "
+                "results; it stays as it is, and what is still missing is made by this version."
+            )
+        )
 
 
 class TrainStep:
@@ -64,6 +85,8 @@ class TrainStep:
     def __call__(self, run: ReconstructionRun) -> None:
         """Train, and write the scene after everything else."""
         began = time.perf_counter()
+        if remove_former_checkpoints(run.output / CHECKPOINTS, run.progress):
+            rewrite_config(run)  # which names the versions that train
         if count_blocks(run) == 1 and not any((run.output / CHECKPOINTS).glob("*.npz")):
             choose_materials(run)  # before the plan, which shares out what is left of the time
         dataset, config = run.dataset, run.config
@@ -225,6 +248,7 @@ def _write_record(
     if (exposures := find_exposures(shading)) is not None:
         record["exposures"] = exposures.as_dict([view.name for view in dataset.views])
     distances = dict(zip((view.name for view in dataset.views), nearest_world.tolist(), strict=True))
+    record[versions.STATED] = versions.RESULTS_VERSION
     record["nearest_world"] = {name: distance for name, distance in distances.items() if distance > 0}
     write_json(output / TRAINING, record)
 

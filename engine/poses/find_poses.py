@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
+from octasplat.engine.core import versions
 from octasplat.engine.core.errors import CancelledError, ColmapCrashError, DatasetError, DiskFullError
 from octasplat.engine.core.events import (
     CheckpointWritten,
@@ -122,7 +123,8 @@ def find_poses(
                 progress(CheckpointWritten(process.step, str(stored)))
             raise
         record = read_pose_record(work / FOUND_FOLDER)
-        write_json(work / FOUND_FOLDER / RECORD_FILE, {**record, "photographs_sha256": sha256})
+        found = {"photographs_sha256": sha256, versions.STATED: versions.RESULTS_VERSION}
+        write_json(work / FOUND_FOLDER / RECORD_FILE, {**record, **found})
         (work / FOUND_FOLDER).rename(output)  # in one step: the folder is whole or is not there
         process.tell_end()
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from octasplat.engine.core import versions
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.name_lists import name_list
 from octasplat.engine.core.writing import replace_folder, write_json
@@ -20,7 +21,8 @@ from octasplat.engine.poses.config import RECORD_FILE
 
 _FOUND_MODEL = re.compile(r"(?:(?P<folder>.*)/)?poses/(?P<number>\d+)/?")
 """How one of the models that a search has found is called, with the folder of a run before it or without."""
-_OF_TAKEN_ONLY = ("number", "other_models", "photographs_sha256")
+_OF_SEARCH = ("photographs_sha256", versions.STATED)
+_OF_TAKEN_ONLY = ("number", "other_models", *_OF_SEARCH)
 """What only the record of the model that is taken says."""
 _MAX_DESCRIBED = 8
 
@@ -132,7 +134,7 @@ def choose_found_model(poses: Path, number: int) -> None:
     for path in _model_files(new / str(number)):
         path.rename(new / path.name)
     (new / str(number)).rmdir()
-    shared = {name: record[name] for name in ("photographs_sha256",) if name in record}
+    shared = {name: record[name] for name in _OF_SEARCH if name in record}
     write_json(new / RECORD_FILE, {**read_pose_record(new), "number": number, **shared})
     write_other_models(new)
     replace_folder(poses, new)

@@ -4,29 +4,25 @@ Imports neither torch nor numba.
 """
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from functools import cache
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, Field, TypeAdapter, ValidationError, model_validator
+from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.poses.found_models import parse_found_model
 from octasplat.engine.runs.run_settings import RunSettings
-from octasplat.engine.settings.base import Settings
+from octasplat.engine.runs.setting_names import check_names, leaf_paths, named_values, value_at
 from octasplat.engine.settings.fields import ADVANCED
 from octasplat.engine.settings.nested_options import merge_options
 from octasplat.engine.settings.preset_names import PRESETS, PRESETS_WITH_MATERIALS
-from octasplat.engine.settings.refusals import (
-    InvalidSettingsError,
-    Refusal,
-    refusals_from,
-    refuse_unknown_setting,
-    submodels,
-)
-from octasplat.engine.settings.renamed_settings import former_names, replace_former_names
+from octasplat.engine.settings.refusals import InvalidSettingsError, Refusal, refusals_from
+from octasplat.engine.settings.renamed_settings import replace_former_names
 from octasplat.engine.train.config import TrainConfig, preset, with_materials
+
+GIVEN = "given"
+"""Of a run's ``config.json``: the names of the settings that were asked for, see :func:`given_settings`."""
 
 
 class ReconstructionConfig(RunSettings):
@@ -144,6 +140,30 @@ def requested_settings(
     return {**values, "train": changes} if changes else values
 
 
+def given_settings(
+    settings: Mapping[str, object],
+    *,
+    materials: bool | None = None,
+    train: Mapping[str, Any] | None = None,
+    assignments: Sequence[str] = (),
+) -> tuple[str, ...]:
+    """Return the names, with dots, of the settings that were given, also those given what they are anyway.
+
+    Args:
+        settings: fields of :class:`RunSettings`.
+        materials: as for :func:`resolve_config`; None where nothing was said of them.
+        train: as for :func:`resolve_config`.
+        assignments: as for :func:`resolve_config`.
+
+    Raises:
+        InvalidSettingsError: an unknown name.
+    """
+    values, changes = _collect_changes(settings, materials, train, assignments)
+    # an empty section says nothing of what is in it
+    paths = (path for path in leaf_paths(changes, ()) if value_at(changes, path) != {})
+    return tuple(sorted({*values, *(".".join(path) for path in paths)}))
+
+
 def revise_requested(requested: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """Return :func:`requested_settings` with changes; another preset brings its own settings."""
     kept, train = {**requested, **changes}, changes.get("train", {})
@@ -164,11 +184,12 @@ def revise_config(
     settings: Mapping[str, object] | None = None,
     train: Mapping[str, Any] | None = None,
     assignments: Sequence[str] = (),
+    given: Sequence[str] | None = None,
 ) -> ReconstructionConfig:
     """Return a configuration with changes; another preset brings its own settings of the training.
 
     Where the changes switch materials on or off, the rest of what that means comes with it, but for the
-    settings that differ from those of the preset.
+    settings that were given.
 
     Args:
         before: the configuration, as JSON.
@@ -176,6 +197,8 @@ def revise_config(
         settings: fields of :class:`RunSettings`; those that are not there stay as they are.
         train: as for :func:`resolve_config`.
         assignments: as for :func:`resolve_config`.
+        given: names of the settings of ``before`` that were given, see :func:`given_settings`; None takes
+            those that differ from the settings of its preset.
 
     Raises:
         InvalidSettingsError: an unknown name, a value out of range, or settings that contradict each other.
@@ -190,11 +213,30 @@ def revise_config(
     elif _learns_materials(merge_options(former, changes)) == learnt:
         return _validate_config({**values, "train": merge_options(former, changes)})
     else:
-        # materials were switched: what differs from the old preset stays, the new one gives the rest
-        former = _changed_values(_preset_settings(before.get("preset"), learnt), former)
+        # materials were switched: what was given stays, the new preset gives the rest
+        former = (
+            _changed_values(_preset_settings(before.get("preset"), learnt), former)
+            if given is None
+            else named_values(former, given)
+        )
     requested = merge_options(former, changes)
     base = _preset_settings(values.get("preset"), _learns_materials(requested))
     return _validate_config({**values, "train": merge_options(base, requested)})
+
+
+def read_given(path: Path) -> tuple[str, ...] | None:
+    """Return the names of the settings that a run was given, by its ``config.json``.
+
+    None where the file does not say so, as those of earlier versions, or cannot be read, of which whoever
+    needs it tells.
+    """
+    try:
+        names = json.loads(path.read_text(encoding="utf-8"))[GIVEN]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        return None
+    return tuple(names)
 
 
 def read_config(path: Path) -> ReconstructionConfig:
@@ -228,7 +270,7 @@ def _collect_changes(
     changes: dict[str, Any] = {} if materials is None else {"materials": {"learn": materials}}
     if train:
         train = replace_former_names((TrainConfig,), train)
-        _check_names(train)
+        check_names(train)
         changes = merge_options(changes, train)
     for assignment in assignments:
         path, value = _read_assignment(assignment)
@@ -238,7 +280,7 @@ def _collect_changes(
         if RunSettings.model_fields.keys() & value:  # a setting of the run, not of its training
             values |= value
             continue
-        _check_names(value)
+        check_names(value)
         changes = merge_options(changes, value)
     return values, changes
 
@@ -303,77 +345,3 @@ def _changed_values(base: Mapping[str, Any], values: Mapping[str, Any]) -> dict[
         elif value != old:
             found[key] = value
     return found
-
-
-def _check_names(train: Mapping[str, Any]) -> None:
-    """Refuse settings of the training that there are not, with the nearest name.
-
-    Raises:
-        InvalidSettingsError: some are unknown.
-    """
-    unknown = list(_unknown_paths((TrainConfig,), train, ("train",)))
-    if unknown:
-        raise InvalidSettingsError(
-            [
-                refuse_unknown_setting(path, _setting_names(), former=former_setting_names())
-                for path in unknown
-            ]
-        )
-
-
-def _unknown_paths(
-    models: Sequence[type[BaseModel]], values: Mapping[str, Any], path: tuple[str, ...]
-) -> Iterator[tuple[str, ...]]:
-    """Yield the paths of values that none of ``models`` has a field for."""
-    for key, value in values.items():
-        place = (*path, str(key))
-        infos = [model.model_fields[key] for model in models if key in model.model_fields]
-        if not infos:
-            former = (model.former_settings for model in models if issubclass(model, Settings))
-            # former settings are read, and refused elsewhere if they differ
-            if not any(key in names for names in former):
-                yield from _leaf_paths(value, place)
-        elif isinstance(value, Mapping):
-            inner = tuple(model for info in infos for model in submodels(info.annotation))
-            yield from _unknown_paths(inner, value, place)
-
-
-def _leaf_paths(value: object, path: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
-    if isinstance(value, Mapping) and value:
-        for key, inner in value.items():
-            yield from _leaf_paths(inner, (*path, str(key)))
-    else:
-        yield path
-
-
-@cache
-def _setting_names() -> tuple[str, ...]:
-    """Return the dotted names of all settings."""
-    return (*RunSettings.model_fields, *dict.fromkeys(_names_in((TrainConfig,), "")))
-
-
-def _names_in(models: Sequence[type[BaseModel]], prefix: str) -> Iterator[str]:
-    for model in models:
-        for name, info in model.model_fields.items():
-            inner = submodels(info.annotation)
-            if inner:
-                yield from _names_in(inner, f"{prefix}{name}.")
-            else:
-                yield prefix + name
-
-
-@cache
-def former_setting_names() -> Mapping[str, str]:
-    """Return the names of all settings of the training, with dots, by those of the last version."""
-    return dict(_former_in((TrainConfig,), "", ""))
-
-
-def _former_in(models: Sequence[type[BaseModel]], before: str, after: str) -> Iterator[tuple[str, str]]:
-    for model in models:
-        former = {new: old for old, new in former_names(model).fields.items()}
-        for name, info in model.model_fields.items():
-            old = former.get(name, name)
-            if inner := submodels(info.annotation):
-                yield from _former_in(inner, f"{before}{old}.", f"{after}{name}.")
-            elif (before, old) != (after, name):
-                yield before + old, after + name

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from octasplat.engine.core.errors import ConfigError, DatasetError
-from octasplat.engine.core.events import EventListener, PhaseProgress, Warned
+from octasplat.engine.core.events import EventListener, Noted, PhaseProgress, Warned
 from octasplat.engine.core.local_origin import Origin
 from octasplat.engine.dataset import Dataset, load_dataset_model
 from octasplat.engine.dataset.camera_clearance import CameraClearance
@@ -18,7 +18,7 @@ from octasplat.engine.dataset.image_names import match_image_names
 from octasplat.engine.dataset.model_sources import has_model
 from octasplat.engine.dataset.photograph_facts import PhotographFacts
 from octasplat.engine.dataset.photograph_files import image_folder, photographs_below
-from octasplat.engine.dataset.pixel_cache import file_sha256
+from octasplat.engine.dataset.pixel_cache import file_sha256, has_former_cache
 from octasplat.engine.dataset.region import Region
 from octasplat.engine.dataset.scene_split import SplitRule
 from octasplat.engine.dataset.view_frusta import ViewFrusta
@@ -315,9 +315,12 @@ def open_run_dataset(
         DatasetError: the photographs cannot be used.
         OutputError: the cache cannot be written.
     """
+    cache = cache or output / CACHE
+    if has_former_cache(cache):
+        progress(Noted(f"{cache} is of a version with other results, so photographs are decoded again."))
     dataset = Dataset.open(
         scene,
-        cache or output / CACHE,
+        cache,
         max_side=config.max_side,
         test_every=config.test_every,
         held_out=config.held_out,

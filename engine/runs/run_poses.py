@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int64
 
+from octasplat.engine.core import versions
 from octasplat.engine.core.errors import CancelledError, ColmapCrashError, DatasetError
 from octasplat.engine.core.events import EventListener, PhaseProgress, Warned
 from octasplat.engine.core.progress import phase
@@ -78,6 +79,18 @@ def find_missing_poses(
             )
     else:
         choose_found_model(output / POSES, 0 if named is None else named[1])
+
+
+def tell_of_former_poses(output: Path, progress: EventListener) -> None:
+    """Tell where the poses that a new run goes on with were found by a version with other results."""
+    record = read_pose_record(output / POSES)
+    if "photographs_sha256" in record and not versions.has_same_results(record):
+        progress(
+            Warned(
+                f"The poses in {output / POSES} were found by a version with other results; they are taken "
+                "as they are, and found anew where that folder is removed."
+            )
+        )
 
 
 def warn_of_other_models(output: Path, progress: EventListener) -> None:

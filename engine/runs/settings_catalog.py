@@ -14,7 +14,8 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.runs.config import ReconstructionConfig, former_setting_names, resolve_config
+from octasplat.engine.runs.config import ReconstructionConfig, resolve_config
+from octasplat.engine.runs.setting_names import former_setting_names
 from octasplat.engine.settings.fields import Group, SettingLevel, Unit
 from octasplat.engine.settings.preset_names import PRESETS, PRESETS_WITH_MATERIALS
 from octasplat.engine.settings.refusals import InvalidSettingsError, refuse_unknown_setting

@@ -12,6 +12,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from octasplat.engine.core import versions
 from octasplat.engine.core.errors import ConfigError, DatasetError
 from octasplat.engine.core.events import Event, Warned
 from octasplat.engine.core.writing import restore_folder
@@ -34,7 +35,7 @@ from octasplat.engine.poses.pair_proposals import propose_pairs
 from octasplat.engine.poses.photographs import photographs_of_scene, photographs_sha256
 from octasplat.engine.render.image_files import write_png
 from octasplat.engine.runs.config import ReconstructionConfig
-from octasplat.engine.runs.run_poses import find_missing_poses, warn_of_other_models
+from octasplat.engine.runs.run_poses import find_missing_poses, tell_of_former_poses, warn_of_other_models
 from octasplat.engine.settings.refusals import InvalidSettingsError
 from octasplat.workers.worker.job_kinds.reconstruct_kinds import ReconstructKind
 from tests.support.killed_rename import killed_before_rename
@@ -277,3 +278,13 @@ def test_gps_of_zero_is_none_and_photographs_without_it_are_proposed_by_look(
     found = propose_pairs(tmp_path / "some.db", tmp_path / "none.db", 30, seed=0, threads=1)
     assert asked == [list(range(1, 31)), [29, 30]]
     assert {(0, 28), (0, 29)} <= set(found)
+
+
+@pytest.mark.parametrize("results", [versions.RESULTS_VERSION, versions.RESULTS_VERSION - 1])
+def test_new_run_tells_of_poses_that_a_former_version_found(tmp_path: Path, results: int) -> None:
+    write_found(tmp_path / "poses", photographs_sha256="known", results=results)
+    choose_found_model(tmp_path / "poses", 1)  # the record is of the search, whatever model is taken
+    events: list[Event] = []
+    tell_of_former_poses(tmp_path, events.append)
+    assert len(events) == (results != versions.RESULTS_VERSION)
+    assert all(isinstance(event, Warned) and "found anew" in event.message for event in events)

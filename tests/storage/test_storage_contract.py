@@ -283,16 +283,17 @@ def test_trees_lead_nowhere_else(storage: Storage, tmp_path: Path) -> None:
 
 
 MEMORY = """
-import resource, sys
-from octasplat.workers.storage import open_storage
+import pathlib, resource, sys
+from octasplat.workers.storage import open_storage, store_tree
 
 storage = open_storage(sys.argv[1], floor_bytes=0)
+folder = pathlib.Path(sys.argv[3])
 
 def put(megabytes, start):
-    with storage.open_writer() as writer:
+    with (folder / "large.bin").open("wb") as file:
         for number in range(megabytes):
-            writer.write((start + number).to_bytes(8, "big") * (1 << 17))
-        return writer.commit()
+            file.write((start + number).to_bytes(8, "big") * (1 << 17))
+    return store_tree(storage, folder).files[0]
 
 def take(blob):
     return sum(len(piece) for piece in storage.read(blob.sha256))
@@ -306,7 +307,9 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
 
 
 @pytest.mark.exhaustive
-def test_memory_does_not_grow_with_the_content(storage: Storage, s3_address: str) -> None:
+def test_memory_does_not_grow_with_the_content(
+    storage: Storage, s3_address: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     """In a process of its own, as the S3 server of the tests lives in this one."""
     if isinstance(storage, S3Storage):
         address = f"s3://{storage.bucket}/p?endpoint_url={s3_address}"
@@ -315,7 +318,7 @@ def test_memory_does_not_grow_with_the_content(storage: Storage, s3_address: str
         assert path is not None
         address = str(path.parents[2])
     done = subprocess.run(
-        [sys.executable, "-c", MEMORY, address, "160"],
+        [sys.executable, "-c", MEMORY, address, "160", str(tmp_path_factory.mktemp("results"))],
         capture_output=True, text=True, timeout=120, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

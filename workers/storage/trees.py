@@ -4,18 +4,22 @@ A dataset, a checkpoint and the results of an attempt are such trees. Storing th
 makes nothing visible; publishing the manifest is the one step that creates a tree.
 """
 
+import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import BinaryIO
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from octasplat.engine.core.portable_names import NameSet
 from octasplat.workers.storage.errors import StorageError
 from octasplat.workers.storage.os_errors import translate_os_errors
-from octasplat.workers.storage.protocol import Storage
+from octasplat.workers.storage.protocol import Blob, Storage
 from octasplat.workers.storage.untrusted_folder import UntrustedFolder
 
 _PIECE_BYTES = 1 << 20
+_MOST_ANNOUNCED_BYTES = 512 << 30
+"""Of a file that is longer a store is not told the length, by which it would hold more of it in memory."""
 
 
 class TreeFile(BaseModel):
@@ -56,7 +60,7 @@ def store_tree(
     metadata: dict[str, str | int | float | bool | None] | None = None,
     on_stored: Callable[[int], None] | None = None,
 ) -> Manifest:
-    """Store the files of ``folder`` as blobs.
+    """Store the files of ``folder`` as blobs, each as far as it is written when it is opened.
 
     Args:
         storage: where to.
@@ -81,15 +85,24 @@ def store_tree(
                 # By the descriptor that was checked, whatever the name stands for by then.
                 source.open(inner) as handle,
                 translate_os_errors(folder / inner),
-                storage.open_writer() as writer,
             ):
-                while piece := handle.read(_PIECE_BYTES):
-                    writer.write(piece)
-                blob = writer.commit()
+                blob = _store_file(storage, handle)
             files.append(TreeFile(path=name, sha256=blob.sha256, size_bytes=blob.size_bytes))
             if on_stored is not None:
                 on_stored(blob.size_bytes)
     return Manifest(files=tuple(files), about=metadata or {})
+
+
+def _store_file(storage: Storage, handle: BinaryIO) -> Blob:
+    """Store a file that may be written meanwhile: no more of it than there is now."""
+    left = os.fstat(handle.fileno()).st_size
+    # at most so long, and not exactly so, as the file may be cut
+    most = left if left <= _MOST_ANNOUNCED_BYTES else None
+    with storage.open_writer(max_bytes=most) as writer:
+        while piece := handle.read(min(left, _PIECE_BYTES)):
+            writer.write(piece)
+            left -= len(piece)
+        return writer.commit()
 
 
 def fetch_tree(storage: Storage, files: Iterable[TreeFile], folder: Path, *, writable: bool = False) -> None:

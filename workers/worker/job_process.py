@@ -89,6 +89,7 @@ def _run_task(task: dict[str, Any], events: _EventStream, stop: threading.Event)
                 should_stop=stop.is_set,
                 kind=task.get("kind", ""),
                 begins_with=Path(task["begins_with"]) if task.get("begins_with") else None,
+                requested=task.get("requested"),
             )
         )
     except CancelledError as error:

@@ -48,7 +48,11 @@ from octasplat.engine.runs.run_folder import (
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.protocol import Tracer
 from octasplat.engine.train.loop.checkpoint import load_best
-from octasplat.workers.worker.job_kinds.reconstruct_kinds import BlockJobConfig, ReconstructJobConfig
+from octasplat.workers.worker.job_kinds.reconstruct_kinds import (
+    BlockJobConfig,
+    ReconstructJobConfig,
+    given_settings,
+)
 from octasplat.workers.worker.live_scene import LiveSceneWriter
 from octasplat.workers.worker.preview import PREVIEW_FILE, PreviewRenderer, PreviewWritten
 from octasplat.workers.worker.publishing import path_redactor, publish_file
@@ -192,6 +196,7 @@ def _run_step(
             should_stop=task.should_stop,
             blocks=blocks,
             steps=(step,),
+            given=given_settings(task.requested),
         )
 
 
@@ -241,6 +246,7 @@ def _run_reconstruction(task: Task) -> None:
                 # those that it was planned with, though this version may reckon memory otherwise
                 blocks=None if has_plan(task.run / BLOCKS) else blocks,
                 start_from=task.begins_with,
+                given=given_settings(task.requested),
             )
     finally:
         _publish_run(task)

@@ -210,6 +210,7 @@ class Supervisor:
             "scene": str(scene) if scene else None,
             "title": title,
             "begins_with": str(begins_with) if begins_with else None,
+            "requested": job.requested,
             "threads": settings.threads,
             "hidden": [str(folder) for folder in settings.own_folders],
             "memory_limit_bytes": self._context.memory_limit_bytes,

@@ -108,6 +108,7 @@ class Task:
         kind: name of the job's kind.
         begins_with: the run of another job that a new run begins with, or None; what an earlier attempt left
             has its own copy of it.
+        requested: the options as they were asked for, as JSON values; None where that is not known.
     """
 
     folder: Path
@@ -119,6 +120,7 @@ class Task:
     should_stop: Callable[[], bool] = field(default=lambda: False)
     kind: str = ""
     begins_with: Path | None = None
+    requested: Mapping[str, Any] | None = None
 
     @property
     def run(self) -> Path:

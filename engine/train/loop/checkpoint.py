@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from octasplat.engine.core import versions
 from octasplat.engine.core.errors import CheckpointError, DamagedCheckpointError
 from octasplat.engine.core.events import EventListener, Warned
 from octasplat.engine.core.writing import atomic_replace
@@ -27,7 +28,7 @@ from octasplat.engine.train.optimization.weight_averaging import WeightAverage
 
 CHECKPOINT_FORMAT = 6
 KEPT_CHECKPOINTS = 2
-_PREFIX = "iteration_"
+_PREFIX, _BEST = "iteration_", "best.npz"
 _GROUPS = ("gaussians", "adam", "average", "densifier", "shading", "poses")
 ARCHIVE_DAMAGE = (
     OSError, KeyError, ValueError, TypeError, AttributeError, EOFError, RuntimeError, MemoryError,
@@ -67,6 +68,7 @@ def save_checkpoint(state: TrainState, folder: Path, fingerprint: str) -> Path:
     path = checkpoint_path(folder, state.iteration)
     meta = {
         "format": CHECKPOINT_FORMAT,
+        versions.STATED: versions.RESULTS_VERSION,
         "fingerprint": fingerprint,
         "iteration": state.iteration,
         "rng": state.rng.bit_generator.state,
@@ -154,9 +156,12 @@ def load_checkpoint(path: Path, fingerprint: str | None = None) -> TrainState:
 def load_latest_checkpoint(folder: Path, fingerprint: str, progress: EventListener) -> TrainState | None:
     """Return the newest checkpoint, if there is any; a damaged one is removed, and the one before is read.
 
+    Those of a version with other results are removed, see :func:`remove_former_checkpoints`.
+
     Raises:
         CheckpointError: it belongs to another configuration or other photographs.
     """
+    remove_former_checkpoints(folder, progress)
     while (path := latest_checkpoint(folder)) is not None:
         try:
             return load_checkpoint(path, fingerprint)
@@ -164,6 +169,39 @@ def load_latest_checkpoint(folder: Path, fingerprint: str, progress: EventListen
             progress(Warned(str(error)))
             path.unlink()
     return None
+
+
+def remove_former_checkpoints(folder: Path, progress: EventListener) -> bool:
+    """Remove checkpoints of a version in which the same settings gave other results, so that none are mixed.
+
+    Args:
+        folder: of the checkpoints.
+        progress: told that the training begins anew.
+
+    Returns:
+        Whether there were any.
+    """
+    former = [path for path in sorted(folder.glob(f"{_PREFIX}*.npz")) if not _has_same_results(path)]
+    if not former:
+        return False
+    progress(
+        Warned(
+            f"The training in {folder.parent} was begun by a version in which the same settings gave other "
+            "results, so it begins anew."
+        )
+    )
+    for path in (folder / _BEST, *former):
+        path.unlink(missing_ok=True)
+    return True
+
+
+def _has_same_results(path: Path) -> bool:
+    """Return whether a checkpoint is of a version with the same results; True where it is damaged."""
+    try:
+        with path.open("rb") as handle, np.load(handle, allow_pickle=False) as archive:
+            return versions.has_same_results(json.loads(str(archive["meta"])))
+    except ARCHIVE_DAMAGE:
+        return True  # told when it is read
 
 
 @dataclass(frozen=True)
@@ -188,7 +226,7 @@ def save_best(best: BestState, folder: Path) -> None:
     }
     arrays |= {f"shading.{name}": value for name, value in best.shading.items()}
     arrays["poses.corrections"] = best.pose_corrections
-    with atomic_replace(folder / "best.npz") as temporary:
+    with atomic_replace(folder / _BEST) as temporary:
         np.savez(temporary, **arrays)
 
 
@@ -198,7 +236,7 @@ def load_best(folder: Path) -> BestState:
     Raises:
         CheckpointError: the file is missing or damaged.
     """
-    path = folder / "best.npz"
+    path = folder / _BEST
     try:
         groups = _group_arrays(_read_arrays(path))
         gaussians = from_row_arrays(FlatGaussians, groups["gaussians"])

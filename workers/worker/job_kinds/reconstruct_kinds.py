@@ -191,6 +191,23 @@ class BlockKind(JobKind[BlockJobConfig]):
         return None if known is None else known.needed_files(options.number, names)
 
 
+def given_settings(requested: Mapping[str, Any] | None) -> tuple[str, ...] | None:
+    """Return the names of the settings of its run that a job was given.
+
+    Args:
+        requested: the options as they were asked for, or None.
+
+    Returns:
+        The names; None where they are not known, as of a job of another version.
+    """
+    if requested is None:
+        return None
+    try:
+        return options_from_json(_without_start(requested)).given()
+    except InvalidSettingsError:
+        return None
+
+
 def _complete(
     config: ReconstructionConfig,
     blocks: Any = None,
