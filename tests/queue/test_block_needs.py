@@ -10,6 +10,7 @@ import pytest
 from octasplat.engine.core import versions
 from octasplat.workers.db.connections import Pool, open_pool
 from octasplat.workers.db.errors import ConflictError
+from octasplat.workers.db.events_and_logs import list_log_lines
 from octasplat.workers.db.quotas import Quota, QuotaExceededError, check_new_job, set_quota, usage_of
 from octasplat.workers.db.rows import Job
 from octasplat.workers.queue.attempts import Attempt, FencedError
@@ -198,6 +199,25 @@ async def test_job_cancelled_as_its_merge_begins_keeps_its_blocks(
         again = await claimed(pool, await fetched(pool, root.id))
         await again.succeed([], job_queue=SLIPS)
         assert (await fetched(pool, root.id)).state == "succeeded"
+
+
+@pytest.mark.parametrize("from_start", [False, True])
+async def test_retry_of_a_job_cancelled_before_its_merge_is_a_start_of_its_own(
+    conninfo: str, folder: Path, from_start: bool
+) -> None:
+    async with open_pool(conninfo, max_size=6) as pool:
+        root = await start(pool, folder, await claimed(pool))
+        for block in await children(pool, root.id):
+            await (await claimed(pool, block)).succeed([], job_queue=SLIPS)
+        async with pool.connection() as connection:
+            canceled = await cancel_job(connection, SLIPS, root.id)
+            assert canceled.state == "canceled"
+            await retry_job(connection, SLIPS, root.id, from_start=from_start)
+        again = (await claimed(pool, await fetched(pool, root.id))).job
+        assert (again.attempt, again.count_starts(again.attempt)) == (2, 2)
+        async with pool.connection() as connection:
+            lines = await list_log_lines(connection, root.id)
+        assert [line.text for line in lines if line.attempt == 2] == ["Attempt 2"]
 
 
 async def test_results_lost_twice_fail_with_the_name_of_the_block(conninfo: str, folder: Path) -> None:
