@@ -24,7 +24,14 @@ from octasplat.workers.queue.block_jobs import (
 from octasplat.workers.queue.block_results import files_from_others
 from octasplat.workers.queue.fair_share import choose_job
 from octasplat.workers.queue.job_results import ResultFile
-from octasplat.workers.queue.jobs import create_job, delete_job, list_jobs, lock_blocks, retry_job
+from octasplat.workers.queue.jobs import (
+    create_job,
+    delete_job,
+    list_jobs,
+    lock_blocks,
+    requeue_job,
+    retry_job,
+)
 from octasplat.workers.queue.recovery import StalledAttempts, recover_stalled_jobs
 from octasplat.workers.queue.storage_leases import storage_lease
 from octasplat.workers.queue.usage_figures import running_by_queue, worked_seconds
@@ -36,6 +43,7 @@ from octasplat.workers.worker.job_kinds import get_job_kind
 from tests.support.queue_jobs import NEW, SLIPS, claimed, fetched
 
 PLANNED = "f" * 64
+AS_RESTORED = "UPDATE jobs SET state = 'queued', worker = NULL WHERE state = 'running'"
 
 
 def checkpoint() -> dict[str, object]:
@@ -304,6 +312,36 @@ async def test_whole_that_cannot_be_merged_does_not_begin_anew_for_ever(conninfo
             await retry_job(connection, SLIPS, root.id, from_start=False)
         root = await start(pool, folder, await claimed(pool, await fetched(pool, root.id)))
         assert (await settle(pool, root.id)).state == "queued"
+
+
+@pytest.mark.parametrize("ending", ["canceled", "canceled under way", "failed"])
+async def test_blocks_do_not_outlive_a_job_that_was_restored_from_a_backup(
+    conninfo: str, folder: Path, ending: str
+) -> None:
+    """It is queued then, with blocks that wait or run, and not only waits for these."""
+    async with open_pool(conninfo, max_size=6) as pool:
+        root = await start(pool, folder, await claimed(pool), (1, 2, 3))
+        done, running, _ = await children(pool, root.id)
+        await (await claimed(pool, done)).succeed([], job_queue=SLIPS)
+        async with pool.connection() as connection:
+            await connection.execute(AS_RESTORED)
+            for orphan in (root, running):
+                await requeue_job(connection, SLIPS, await fetched(pool, orphan.id))
+        under_way = await claimed(pool, await fetched(pool, running.id))
+        again = None if ending == "canceled" else await claimed(pool, await fetched(pool, root.id))
+        if ending != "failed":
+            async with pool.connection() as connection:
+                await cancel_job(connection, SLIPS, root.id)
+        if again is not None:
+            await (again.fail({"type": "x", "message": "y"}) if ending == "failed" else again.cancel())
+        await recover_stalled_jobs(pool, SLIPS, 5, StalledAttempts(5))
+        assert [block.state for block in await children(pool, root.id)] == [
+            "succeeded", "canceling", "canceled",
+        ]  # fmt: skip
+        await under_way.cancel()
+        assert (await settle(pool, root.id)).state == ending.split()[0]
+        async with pool.connection() as connection:
+            assert await unsettled_roots(connection) == []
 
 
 async def test_cancelling_by_a_front_end_of_the_last_version_is_settled(conninfo: str, folder: Path) -> None:
