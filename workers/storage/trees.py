@@ -9,12 +9,14 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from octasplat.engine.core.portable_names import NameSet
+from octasplat.engine.core.portable_names import FileNameError, NameSet
 from octasplat.workers.storage.errors import StorageError
 from octasplat.workers.storage.os_errors import translate_os_errors
 from octasplat.workers.storage.protocol import Storage
 from octasplat.workers.storage.untrusted_folder import UntrustedFolder
 
+TREE_ERRORS = (StorageError, FileNameError)
+"""What storing and fetching trees raise: also for names that programs and users have chosen."""
 _PIECE_BYTES = 1 << 20
 
 
