@@ -75,7 +75,9 @@ async def start_blocks(
     wanted = {block.number: complete(block.options) for block in blocks}
     for child in await blocks_of(connection, [root.id]):
         number = int(child.options["number"])
-        if number in wanted and complete(child.options) == wanted[number]:
+        # One that is being cancelled would take the job along when it ends.
+        is_usable = child.state != "canceling" and number in wanted
+        if is_usable and complete(child.options) == wanted[number]:
             kept[number] = child
         else:
             await connection.execute("DELETE FROM jobs WHERE id = %s", [child.id])
