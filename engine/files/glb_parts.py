@@ -1,20 +1,36 @@
 """Scenes for which one GLB is too small: the names of their files, and what each says of its place."""
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from octasplat.engine.files.glb_container import asset_extras
 
 PART_KEY = "octasplat_part"
 """In the extras of a file that is one of several of a scene: its place among them, from 1, and their number.
 """
+T = TypeVar("T")
 
 
 def part_paths(path: Path, count: int) -> tuple[Path, ...]:
     """Return the files of a scene for which one is too small: ``path``, ``<stem>.part2.glb`` and so on."""
     return (path, *(path.with_name(f"{path.stem}.part{k}{path.suffix}") for k in range(2, count + 1)))
+
+
+def in_order_of_writing(paths: Sequence[Path], contents: Sequence[T]) -> Iterator[tuple[Path, T]]:
+    """Yield the files of a scene with what each is to hold, the first file last.
+
+    A run that goes on takes the first one for all of them, as only that one is named: it is not there before
+    the others are, and the one of an earlier export is not beside parts of another scene.
+
+    Args:
+        paths: of all files, by :func:`part_paths`.
+        contents: of each.
+    """
+    if len(paths) > 1:
+        paths[0].unlink(missing_ok=True)
+    yield from reversed(list(zip(paths, contents, strict=True)))
 
 
 def parts_left_over(path: Path, written: Collection[Path]) -> tuple[Path, ...]:

@@ -122,7 +122,8 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     count = -(-len(scene) // most)
     ends = [number * len(scene) // count for number in range(count + 1)]
     paths = glb_parts.part_paths(path, count)
-    for number, (part_path, rows) in enumerate(zip(paths, itertools.pairwise(ends), strict=True), start=1):
+    numbered = list(enumerate(itertools.pairwise(ends), start=1))
+    for part_path, (number, rows) in glb_parts.in_order_of_writing(paths, numbered):
         part = scene.view(slice(*rows))
         text = glb_container.json_bytes(_gltf_json(part, layout, options.facts, (number, count)))
         data = _binary_blocks(part, layout)

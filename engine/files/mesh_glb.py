@@ -253,7 +253,7 @@ def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions)
     png = white_with_alpha_png(options.falloff_texture_size, options.q)
     parts = _plan_files(soup, path, (len(png), len(ramp)), options)
     paths = glb_parts.part_paths(path, len(parts))
-    for part_path, (layout, chunks) in zip(paths, parts, strict=True):
+    for part_path, (layout, chunks) in glb_parts.in_order_of_writing(paths, parts):
         bounds: list[Bounds] = []
         data = _octagon_data(
             layout=layout, soup=soup, chunks=chunks, images=(png, ramp), options=options, bounds=bounds

@@ -43,7 +43,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
         OSError: a file cannot be written.
     """
     scene = select_for_export(gaussians, path, options)
-    former = former_folders(path, _chunk_names(path), _are_of_a_chunk)
+    former = former_folders(path, _chunk_names, _are_of_a_chunk)
     extent_world = max(map(_spread, scene.means_world.T)) / CHUNKS_ACROSS
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="octasplat-", dir=path.parent) as folder:

@@ -50,7 +50,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     """
     scene = select_for_export(gaussians, path, options)
     check_scales(scene, path)
-    former = former_folders(path, _content_folders(path), _are_tiles)
+    former = former_folders(path, _content_folders, _are_tiles)
     depth = len(level_counts(len(scene), FEWEST_IN_ROOT)) - 1
     cells = halve_points(scene.means_world, depth)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,5 +1,6 @@
 """Request to train a scene in blocks: kept with its run, and resolved to their number."""
 
+import shutil
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -9,7 +10,7 @@ from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.writing import write_text
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.runs.config import ReconstructionConfig
-from octasplat.engine.runs.run_folder import BLOCKS
+from octasplat.engine.runs.run_folder import BLOCKS, VIEWS
 from octasplat.engine.train.sampling.pixel_sampler import valid_pixel_fraction
 
 REQUEST = "request.json"
@@ -51,15 +52,24 @@ class BlockRequest(BaseModel):
 def keep_request(output: Path, request: BlockRequest | None, *, is_new: bool) -> BlockRequest | None:
     """Return the request of a run: the one given, which a new run keeps, or the one that it has kept.
 
+    A run that was stopped before it had opened its photographs may take another one: its disk may have been
+    full before the first one was kept.
+
     Raises:
-        ConfigError: the run was begun with another one.
+        ConfigError: the run was begun with another one, or stopped before it had kept one.
     """
     path = output / BLOCKS / REQUEST
     given = None if request is not None and request.count == 1 else request  # one block is an ordinary run
-    if is_new:
+    if is_new or (request is not None and not (output / VIEWS).exists()):
         if given is not None:
             write_text(path, given.model_dump_json(indent=2) + "\n")
+        else:
+            shutil.rmtree(path.parent, ignore_errors=True)
         return given
+    if request is None and path.parent.is_dir() and not path.exists():
+        raise ConfigError(
+            f"The run in {output} was stopped before it had kept how its blocks are made; repeat --blocks."
+        )
     try:
         kept = BlockRequest.model_validate_json(path.read_text(encoding="utf-8")) if path.exists() else None
     except (OSError, ValidationError) as error:

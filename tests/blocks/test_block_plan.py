@@ -1,5 +1,8 @@
 """``octasplat plan``: blocks, time and memory from the sparse points, before anything starts."""
 
+import errno
+import json
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +29,7 @@ from octasplat.engine.blocks.piece_settings import (
 )
 from octasplat.engine.blocks.scene_plan import ScenePlan, save_plan
 from octasplat.engine.blocks.sparse_plan import plan_from_points
-from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError, DiskFullError
 from octasplat.engine.core.events import ignore_events
 from octasplat.engine.dataset import SparsePoints, load_dataset_model
 from octasplat.engine.dataset.image_sizes import ImageSizes
@@ -35,7 +38,8 @@ from octasplat.engine.operations.block_cost import BlockShare, estimate_blocks, 
 from octasplat.engine.operations.block_options import BlockOptions, parse_memory
 from octasplat.engine.operations.cost_model import estimate_reconstruction, gaussians_within
 from octasplat.engine.operations.plan import PlanRequest, run
-from octasplat.engine.pipeline import BlockRequest
+from octasplat.engine.pipeline import BlockRequest, output_folder, reconstruct
+from octasplat.engine.pipeline.block_request import keep_request
 from octasplat.engine.pipeline.block_steps import count_blocks
 from octasplat.engine.pipeline.run import ReconstructionRun
 from octasplat.engine.runs.config import resolve_config
@@ -323,3 +327,32 @@ def test_rays_of_a_block_take_longer_for_what_is_around_it() -> None:
     among = estimate_blocks(config, photographs, [quarter] * 4, None, 1)
     growth = among.blocks[0].stage_seconds["train"] / alone.blocks[0].stage_seconds["train"]
     assert 1.2 < growth < 1.8
+
+
+def test_command_is_repeated_where_the_disk_was_full_before_its_blocks_were_kept(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    output, config, blocks = tmp_path / "run", resolve_config("fast"), BlockRequest(count=2)
+
+    def find_no_room(*_arguments: object, **_named: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "write_text", find_no_room)
+        patched.setattr(output_folder, "write_json", write_config_alone)
+        with pytest.raises(DiskFullError):
+            reconstruct(scene, output, config, blocks=blocks)
+    assert (output / "config.json").exists()
+    with pytest.raises(ConfigError, match="repeat --blocks"):  # else it would be trained in one
+        reconstruct(scene, output, config, resume=True)
+    assert keep_request(output, blocks, is_new=False) == blocks == keep_request(output, None, is_new=False)
+    assert keep_request(output, BlockRequest(count=1), is_new=False) is None
+    assert keep_request(output, None, is_new=False) is None
+    keep_request(output, blocks, is_new=False)
+    (output / "views.json").touch()
+    with pytest.raises(ConfigError, match="begun with other blocks"):
+        keep_request(output, BlockRequest(count=3), is_new=False)
+
+
+def write_config_alone(path: Path, value: object) -> None:
+    path.write_bytes(json.dumps(value).encode())

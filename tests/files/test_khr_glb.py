@@ -14,6 +14,8 @@ from octasplat.engine.files import (
     export_scene,
     glb_container,
     importer_for,
+    khr_glb,
+    mesh_glb,
     read_mesh,
     read_scene,
 )
@@ -79,6 +81,32 @@ def test_scene_beyond_the_limit_of_a_file_is_split_in_its_order(
     expected = read_scene(whole)[0]
     for name, array in row_arrays(expected).items():
         np.testing.assert_array_equal(row_arrays(together)[name], array)
+
+
+@pytest.mark.parametrize("name", ["a.splats.glb", "a.glb"])
+def test_first_of_several_files_is_there_when_all_are(
+    make_scene: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """A run that goes on takes a file that is there for written."""
+    scene = make_scene(5000)
+    (path,) = export_scene(scene, tmp_path / name)  # of an earlier export, which held all
+    monkeypatch.setattr(glb_container, "MAX_BYTES", int(0.45 * path.stat().st_size))
+    left = [2]
+
+    def write_until_stopped(*arguments: Any) -> None:
+        left[0] -= 1
+        if left[0] < 0:
+            raise KeyboardInterrupt
+        write_glb(*arguments)
+
+    write_glb = glb_container.write_glb
+    for module in (khr_glb, mesh_glb):
+        monkeypatch.setattr(module, "write_glb", write_until_stopped)
+    with pytest.raises(KeyboardInterrupt):
+        export_scene(scene, path)
+    assert sorted(found.name for found in tmp_path.iterdir()) == [
+        f"{path.stem}.part2.glb", f"{path.stem}.part3.glb",
+    ]  # fmt: skip
 
 
 def test_attributes_of_other_lengths_are_refused(make_scene: Make, tmp_path: Path) -> None:

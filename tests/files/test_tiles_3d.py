@@ -1,6 +1,9 @@
 """3D Tiles: the tree, what its tiles hold, and where they stand."""
 
+import errno
 import json
+import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
@@ -11,7 +14,7 @@ import numpy as np
 import pytest
 
 from octasplat.engine.core.earth_frame import geocentric_from_metres
-from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.core.errors import DiskFullError, SceneFileError
 from octasplat.engine.core.georeference import WGS84, Georeference, matrix_rows
 from octasplat.engine.files import (
     ExportOptions,
@@ -282,6 +285,56 @@ def test_tiles_of_before_are_replaced_and_nothing_else(scene: FlatGaussians, tmp
     index.write_text('{"root": {"content": {"uri": "elsewhere/a.glb"}}}')
     with pytest.raises(SceneFileError, match="tiles is there already and no part of it"):
         export_scene(scene, index)
+
+
+def test_export_that_finds_no_room_for_its_index_leaves_the_one_of_before(
+    scene: FlatGaussians, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    index, *_ = export_scene(scene, tmp_path / "out" / "tileset.json")
+    before = {path: path.read_bytes() for path in index.parent.rglob("*") if path.is_file()}
+
+    def find_no_room(*_arguments: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(shutil, "copyfile", find_no_room)
+        for path in (index, tmp_path / "new" / "tileset.json"):
+            with pytest.raises(DiskFullError):
+                export_scene(scene.select(slice(0, 50)), path)
+    assert {path: path.read_bytes() for path in index.parent.rglob("*") if path.is_file()} == before
+    assert list((tmp_path / "new").iterdir()) == []
+
+
+@pytest.mark.parametrize(("has_former", "done"), [(False, 0), (False, 1), (True, 0), (True, 1), (True, 2)])
+def test_export_goes_on_where_one_was_killed_while_it_moved_tiles(
+    scene: FlatGaussians, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_former: bool, done: int
+) -> None:
+    index = tmp_path / "out" / "tileset.json"
+    if has_former:  # whose tiles are moved first
+        export_scene(scene.select(slice(0, 200)), index)
+    places: list[Path] = []
+    move = shutil.move
+
+    def move_until_killed(source: Path, target: Path) -> None:
+        if len(places) < done:
+            move(source, target)
+        places.append(target)
+        if len(places) >= max(done, 1):
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(shutil, "move", move_until_killed)
+        with pytest.raises(KeyboardInterrupt):
+            export_scene(scene, index)
+    assert not index.exists()
+    export_scene(scene, index)
+    whole, *_ = export_scene(scene, tmp_path / "whole" / "tileset.json")
+
+    def content(folder: Path) -> dict[str, bytes]:
+        files = (path for path in folder.rglob("*") if path.is_file())
+        return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+
+    assert content(index.parent) == content(whole.parent)
 
 
 def test_unfit_scenes_are_refused(scene: FlatGaussians, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import pytest
 from octasplat.engine.core import versions
 from octasplat.workers.db.connections import Pool, open_pool
 from octasplat.workers.db.errors import ConflictError
+from octasplat.workers.db.events_and_logs import list_log_lines
 from octasplat.workers.db.quotas import Quota, QuotaExceededError, check_new_job, set_quota, usage_of
 from octasplat.workers.db.rows import Job
 from octasplat.workers.queue.attempts import Attempt, FencedError
@@ -23,7 +24,14 @@ from octasplat.workers.queue.block_jobs import (
 from octasplat.workers.queue.block_results import files_from_others
 from octasplat.workers.queue.fair_share import choose_job
 from octasplat.workers.queue.job_results import ResultFile
-from octasplat.workers.queue.jobs import create_job, delete_job, list_jobs, lock_blocks, retry_job
+from octasplat.workers.queue.jobs import (
+    create_job,
+    delete_job,
+    list_jobs,
+    lock_blocks,
+    requeue_job,
+    retry_job,
+)
 from octasplat.workers.queue.recovery import StalledAttempts, recover_stalled_jobs
 from octasplat.workers.queue.storage_leases import storage_lease
 from octasplat.workers.queue.usage_figures import running_by_queue, worked_seconds
@@ -35,6 +43,7 @@ from octasplat.workers.worker.job_kinds import get_job_kind
 from tests.support.queue_jobs import NEW, SLIPS, claimed, fetched
 
 PLANNED = "f" * 64
+AS_RESTORED = "UPDATE jobs SET state = 'queued', worker = NULL WHERE state = 'running'"
 
 
 def checkpoint() -> dict[str, object]:
@@ -200,6 +209,25 @@ async def test_job_cancelled_as_its_merge_begins_keeps_its_blocks(
         assert (await fetched(pool, root.id)).state == "succeeded"
 
 
+@pytest.mark.parametrize("from_start", [False, True])
+async def test_retry_of_a_job_cancelled_before_its_merge_is_a_start_of_its_own(
+    conninfo: str, folder: Path, from_start: bool
+) -> None:
+    async with open_pool(conninfo, max_size=6) as pool:
+        root = await start(pool, folder, await claimed(pool))
+        for block in await children(pool, root.id):
+            await (await claimed(pool, block)).succeed([], job_queue=SLIPS)
+        async with pool.connection() as connection:
+            canceled = await cancel_job(connection, SLIPS, root.id)
+            assert canceled.state == "canceled"
+            await retry_job(connection, SLIPS, root.id, from_start=from_start)
+        again = (await claimed(pool, await fetched(pool, root.id))).job
+        assert (again.attempt, again.count_starts(again.attempt)) == (2, 2)
+        async with pool.connection() as connection:
+            lines = await list_log_lines(connection, root.id)
+        assert [line.text for line in lines if line.attempt == 2] == ["Attempt 2"]
+
+
 async def test_results_lost_twice_fail_with_the_name_of_the_block(conninfo: str, folder: Path) -> None:
     async with open_pool(conninfo, max_size=6) as pool:
         root = await start(pool, folder, await claimed(pool))
@@ -284,6 +312,42 @@ async def test_whole_that_cannot_be_merged_does_not_begin_anew_for_ever(conninfo
             await retry_job(connection, SLIPS, root.id, from_start=False)
         root = await start(pool, folder, await claimed(pool, await fetched(pool, root.id)))
         assert (await settle(pool, root.id)).state == "queued"
+
+
+@pytest.mark.parametrize("ending", ["canceled", "canceled under way", "failed"])
+async def test_blocks_do_not_outlive_a_job_that_was_restored_from_a_backup(
+    conninfo: str, folder: Path, ending: str
+) -> None:
+    """It is queued then, with blocks that wait or run, and not only waits for these."""
+    async with open_pool(conninfo, max_size=6) as pool:
+        root = await start(pool, folder, await claimed(pool), (1, 2, 3))
+        done, running, _ = await children(pool, root.id)
+        await (await claimed(pool, done)).succeed([], job_queue=SLIPS)
+        async with pool.connection() as connection:
+            await connection.execute(AS_RESTORED)
+            for orphan in (root, running):
+                await requeue_job(connection, SLIPS, await fetched(pool, orphan.id))
+        under_way = await claimed(pool, await fetched(pool, running.id))
+        again = None if ending == "canceled" else await claimed(pool, await fetched(pool, root.id))
+        if ending != "failed":
+            async with pool.connection() as connection:
+                await cancel_job(connection, SLIPS, root.id)
+        if again is not None:
+            await (again.fail({"type": "x", "message": "y"}) if ending == "failed" else again.cancel())
+        await recover_stalled_jobs(pool, SLIPS, 5, StalledAttempts(5))
+        assert [block.state for block in await children(pool, root.id)] == [
+            "succeeded", "canceling", "canceled",
+        ]  # fmt: skip
+        async with pool.connection() as connection:
+            assert await unsettled_roots(connection) == []
+            await retry_job(connection, SLIPS, root.id, from_start=False)  # before that block has stopped
+        root = await start(pool, folder, await claimed(pool, await fetched(pool, root.id)), (1, 2, 3))
+        with pytest.raises(FencedError):
+            await under_way.cancel()
+        assert (await settle(pool, root.id)).waits_for_blocks
+        assert [block.state for block in await children(pool, root.id)] == ["succeeded", "queued", "queued"]
+        async with pool.connection() as connection:
+            assert await unsettled_roots(connection) == []
 
 
 async def test_cancelling_by_a_front_end_of_the_last_version_is_settled(conninfo: str, folder: Path) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from octasplat.engine.core.events import Event, PhaseStarted
+from octasplat.engine.core.events import Event, PhaseFinished, PhaseStarted
 from octasplat.workers.worker.job_kinds import JobKind, register
 from octasplat.workers.worker.task import Task
 from tests.support.attempt_outcomes import write_outcomes
@@ -101,6 +101,15 @@ def _link_results(task: Task, options: HostileOptions) -> None:
 
 def _link_result(task: Task, options: HostileOptions) -> None:
     (task.results / "inner").symlink_to(options.target)
+
+
+def _name_badly(task: Task, options: HostileOptions) -> None:
+    """Write a file of a name that not every system takes, as a result or as poses that were found."""
+    place = task.folder / options.target
+    place.mkdir(parents=True)
+    (place / "nul.txt").write_text("x")
+    task.progress(PhaseFinished("poses", 0.0))  # after which poses are stored
+    (task.results / "done.txt").write_text("done")
 
 
 def _wait_for_gate(task: Task, options: HostileOptions) -> None:
@@ -253,6 +262,7 @@ ATTACKS: Mapping[str, Callable[[Task, HostileOptions], None]] = {
     "link run": _link_run,
     "link results": _link_results,
     "link result": _link_result,
+    "bad name": _name_badly,
     "calls": _change_what_landlock_does_not_know,
     "daemon": _leave_daemon,
     "shared memory": _hog_shared_memory,

@@ -17,12 +17,12 @@ from octasplat.engine.blocks.scene_plan import ScenePlan, load_plan, save_plan
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.events import CheckpointWritten, Event
 from octasplat.engine.dataset.view_tiles import Rectangles
-from octasplat.engine.files.gaussian_ply import read_gaussian_ply
+from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from octasplat.engine.operations.block_options import block_request
 from octasplat.engine.operations.photograph_sizes import photograph_sizes
 from octasplat.engine.pipeline import BlockRequest, reconstruct
 from octasplat.engine.pipeline.block_request import keep_request
-from octasplat.engine.pipeline.output_folder import claim_output
+from octasplat.engine.pipeline.output_folder import claim_output, write_config
 from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.train.loop.checkpoint import load_best
 from octasplat.workers.db.rows import DatasetFile, Job
@@ -38,6 +38,7 @@ from octasplat.workers.worker.reconstruct_handler import reconstruct as run_whol
 from octasplat.workers.worker.reconstruct_handler import train_block
 from octasplat.workers.worker.task import BlocksPlanned, Task
 from octasplat.workers.worker.workspace import Workspace
+from tests.support.shell_scene import shell_scene
 from tests.support.wall_dataset import make_wall_dataset
 
 pytestmark = pytest.mark.heavy
@@ -95,8 +96,9 @@ def run_task(
     return events, workspace
 
 
-def test_merge_goes_on_where_memory_is_reckoned_otherwise_than_when_it_was_planned(
-    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("reached", ["poses", "plan", "scene"])
+def test_run_goes_on_where_memory_is_reckoned_otherwise_than_when_it_was_begun(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reached: str
 ) -> None:
     complete = get_job_kind("reconstruct").resolve({**REQUESTED, "blocks": "auto", "memory": "8G"})
     assert isinstance(complete, ReconstructJobConfig)
@@ -104,18 +106,23 @@ def test_merge_goes_on_where_memory_is_reckoned_otherwise_than_when_it_was_plann
     for name, kept in (("same", most), ("other", most + 1000)):
         task = Task(tmp_path / name, complete.model_dump(mode="json"), scene=scene)
         (task.run / "blocks").mkdir(parents=True)
+        write_config(scene, task.run, complete.run_config())
         keep_request(task.run, BlockRequest(most_gaussians=kept), is_new=True)
-        nothing = Rectangles(np.zeros(0, np.int64), *np.zeros((2, 0, 2), np.int64))
-        block = Block(Box(np.full(3, -np.inf), np.full(3, np.inf)), np.zeros(3), 1.0, nothing)
-        save_plan(ScenePlan((block,), (0,), 10, 10, kept, True), task.run / "blocks")
+        if reached == "plan":
+            nothing = Rectangles(np.zeros(0, np.int64), *np.zeros((2, 0, 2), np.int64))
+            block = Block(Box(np.full(3, -np.inf), np.full(3, np.inf)), np.zeros(3), 1.0, nothing)
+            save_plan(ScenePlan((block,), (0,), 10, 10, kept, True), task.run / "blocks")
+        elif reached == "scene":  # the plan is not in its checkpoint any more
+            write_gaussian_ply(shell_scene(20), task.run / "scene.ply")
         taken = []
 
-        def merge(_scene: Path, output: Path, *_: Any, blocks: BlockRequest | None, **_more: Any) -> None:
+        def go_on(_scene: Path, output: Path, *_: Any, blocks: BlockRequest | None, **_more: Any) -> None:
             taken.append(keep_request(output, blocks, is_new=False))  # noqa: B023
 
-        monkeypatch.setattr(reconstruct_handler, "reconstruct_scene", merge)
+        monkeypatch.setattr(reconstruct_handler, "reconstruct_scene", go_on)
         run_whole(task)
-        assert taken == [BlockRequest(most_gaussians=kept)]
+        assert taken and set(taken) == {BlockRequest(most_gaussians=kept)}
+        assert (task.run / "config.json").exists()
 
 
 @pytest.mark.exhaustive

@@ -65,3 +65,17 @@ def test_results_with_names_outside_of_the_job_are_refused(bench: WorkerHarness,
     job = bench.wait_until_finished(job_id)
     assert job.state == "failed" and job.error is not None and job.error["type"] == "not_a_file"
     assert not is_stored(bench, SECRET)
+
+
+@pytest.mark.parametrize("place", ["results", "run/poses"])
+def test_names_that_not_every_system_takes_are_the_job_s_fault_and_not_its_worker_s(
+    bench: WorkerHarness, place: str
+) -> None:
+    job_id = bench.submit("hostile", options={"attack": "bad name", "target": place})
+    job = bench.wait_until_finished(job_id)
+    if place == "results":
+        assert (job.state, job.attempt) == ("failed", 1)
+        assert job.error is not None and job.error["type"] == "name_refused" and "nul.txt" in str(job.error)
+    else:  # which are wanted for a later attempt alone
+        assert (job.state, job.attempt) == ("succeeded", 1)
+        assert "Warning: a checkpoint could not be stored" in bench.log(job_id)

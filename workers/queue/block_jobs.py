@@ -75,7 +75,9 @@ async def start_blocks(
     wanted = {block.number: complete(block.options) for block in blocks}
     for child in await blocks_of(connection, [root.id]):
         number = int(child.options["number"])
-        if number in wanted and complete(child.options) == wanted[number]:
+        # One that is being cancelled would take the job along when it ends.
+        is_usable = child.state != "canceling" and number in wanted
+        if is_usable and complete(child.options) == wanted[number]:
             kept[number] = child
         else:
             await connection.execute("DELETE FROM jobs WHERE id = %s", [child.id])
@@ -168,9 +170,11 @@ async def add_live_scene_event(connection: Connection, job: Job) -> None:
 
 
 async def settle_root(connection: Connection, job_queue: JobQueue, root_id: uuid.UUID) -> None:
-    """Bring a job that waits for its blocks to where these are; does nothing to any other.
+    """Bring a job that waits for its blocks to where these are; does nothing to most others.
 
-    A block that failed ends the others and then the job; where the job is being canceled, so are its blocks.
+    A block that failed ends the others and then the job; where the job is being canceled, so are its blocks,
+    and where it is over without success those that are left: a job that was restored from a backup is queued
+    beside its blocks.
     """
     # As a rule there is nothing to do, for which not every block has to be locked.
     if not await unsettled_roots(connection, root_id):
@@ -178,6 +182,9 @@ async def settle_root(connection: Connection, job_queue: JobQueue, root_id: uuid
     async with connection.transaction():
         children = await lock_blocks(connection, root_id)
         root = await get_job(connection, root_id, lock=True)
+        if root is not None and root.state in ("failed", "canceled"):
+            for child in children:
+                await _cancel(connection, job_queue, child)
         if root is None or not root.waits_for_blocks:
             return
         ended = [child for child in children if child.state in ("failed", "canceled")]
@@ -194,7 +201,7 @@ async def settle_root(connection: Connection, job_queue: JobQueue, root_id: uuid
 
 
 async def unsettled_roots(connection: Connection, root_id: uuid.UUID | None = None) -> list[uuid.UUID]:
-    """Return the jobs that wait for blocks and may have to go on, or to end; of all, or of the one given."""
+    """Return the jobs whose blocks may let them go on or end, or have to end; of all, or of the one given."""
     cursor = await connection.execute(
         """
         SELECT id FROM jobs AS root
@@ -202,6 +209,10 @@ async def unsettled_roots(connection: Connection, root_id: uuid.UUID | None = No
           AND (%(id)s::uuid IS NULL OR id = %(id)s) AND (
             state = 'canceling' OR NOT EXISTS (SELECT FROM job_needs WHERE job_id = root.id)
             OR EXISTS (SELECT FROM jobs WHERE root_id = root.id AND state IN ('failed', 'canceled')))
+        UNION
+        SELECT root.id FROM jobs AS block JOIN jobs AS root ON root.id = block.root_id
+        WHERE block.state IN ('queued', 'running') AND root.state IN ('failed', 'canceled')
+          AND (%(id)s::uuid IS NULL OR block.root_id = %(id)s)
         ORDER BY id
         """,
         {"role": ROOT, "id": root_id},

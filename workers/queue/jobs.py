@@ -238,10 +238,12 @@ async def retry_job(
         job.refuse_block()
         if job.state not in ("failed", "canceled"):
             raise ConflictError(f"Only failed and canceled jobs are retried; this one is {job.state}.")
+        # What was to go on with its blocks and was cancelled before that is begun anew.
         await connection.execute(
             """
             UPDATE jobs SET rescues = 0, error = NULL, stage = NULL, step = NULL, total_steps = NULL,
                 seconds_left = NULL, finished_at = NULL, worker = NULL, expires_at = NULL, begun_at = NULL,
+                continuations = array_remove(continuations, attempt + 1),
                 checkpoint = CASE WHEN %(fresh)s THEN NULL ELSE checkpoint END,
                 begun_anew = CASE WHEN %(fresh)s THEN NULL ELSE begun_anew END,
                 psnr = CASE WHEN %(fresh)s THEN NULL ELSE psnr END,

@@ -11,12 +11,14 @@ from typing import BinaryIO
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from octasplat.engine.core.portable_names import NameSet
+from octasplat.engine.core.portable_names import FileNameError, NameSet
 from octasplat.workers.storage.errors import StorageError
 from octasplat.workers.storage.os_errors import translate_os_errors
 from octasplat.workers.storage.protocol import Blob, Storage
 from octasplat.workers.storage.untrusted_folder import UntrustedFolder
 
+TREE_ERRORS = (StorageError, FileNameError)
+"""What storing and fetching trees raise: also for names that programs and users have chosen."""
 _PIECE_BYTES = 1 << 20
 _MOST_ANNOUNCED_BYTES = 512 << 30
 """Of a file that is longer a store is not told the length, by which it would hold more of it in memory."""

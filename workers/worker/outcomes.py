@@ -9,6 +9,7 @@ import psycopg
 from pydantic import BaseModel, ValidationError
 
 from octasplat.engine.core.errors import OctasplatError
+from octasplat.engine.core.portable_names import FileNameError
 from octasplat.workers.db.quotas import QuotaExceededError
 from octasplat.workers.queue.attempts import Attempt
 from octasplat.workers.queue.block_jobs import NewBlock
@@ -24,6 +25,7 @@ from octasplat.workers.storage.errors import (
     UntrustedFileError,
 )
 from octasplat.workers.storage.os_errors import is_disk_full
+from octasplat.workers.storage.trees import TREE_ERRORS
 from octasplat.workers.worker.checkpoint import plan_digest
 from octasplat.workers.worker.context import DatabaseLostError, WorkerContext
 from octasplat.workers.worker.heartbeat import DATABASE_ERRORS, Heartbeat
@@ -75,7 +77,7 @@ class OutcomeWriter:
         """Store the results and end the job with them."""
         try:
             results = await self._store_results()
-        except StorageError as error:
+        except TREE_ERRORS as error:
             await self.handle_error(error)
             return
         await self.succeed(results)
@@ -107,7 +109,7 @@ class OutcomeWriter:
         except QuotaExceededError as error:
             problem = {"type": "quota", "message": f"What its blocks begin with cannot be stored. {error}"}
             await self._write_with_retries(lambda: self._attempt.fail(problem))
-        except StorageError as error:
+        except TREE_ERRORS as error:
             await self.handle_error(error)
         self._context.host_health.record_success()
 
@@ -115,8 +117,8 @@ class OutcomeWriter:
         """Fail the job, with the results that its program has finished."""
         try:
             await self._with_partial_results(lambda results, note: self._attempt.fail(error, results, note))
-        except QuotaExceededError as excess:
-            message = f"{error['message']} What it has finished cannot be stored. {excess}"
+        except (QuotaExceededError, FileNameError) as refusal:
+            message = f"{error['message']} What it has finished cannot be stored. {refusal}"
             await self._write_with_retries(lambda: self._attempt.fail({**error, "message": message}))
         except StorageError as storage_error:
             await self.handle_error(storage_error)
@@ -152,7 +154,7 @@ class OutcomeWriter:
                     lambda results, note: self._requeue_counted(error, results, note, max_recoveries)
                 )
                 return
-            except (StorageError, QuotaExceededError) as storage_error:
+            except (*TREE_ERRORS, QuotaExceededError) as storage_error:
                 logger.warning("the results there are could not be stored: %s", storage_error)
         await self._write_with_retries(lambda: self._requeue_counted(error, max_recoveries=max_recoveries))
 

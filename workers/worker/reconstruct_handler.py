@@ -31,6 +31,7 @@ from octasplat.engine.pipeline import (
     planned_blocks,
 )
 from octasplat.engine.pipeline import reconstruct as reconstruct_scene
+from octasplat.engine.pipeline.block_request import keep_request
 from octasplat.engine.poses.found_models import read_pose_record
 from octasplat.engine.poses.stored_search import search_folder
 from octasplat.engine.render.image_files import write_png
@@ -204,8 +205,7 @@ def _run_reconstruction(task: Task) -> None:
     assert task.scene is not None
     options = ReconstructJobConfig.model_validate(task.options)
     config = options.run_config()
-    sizes = photograph_sizes(task.scene) if options.memory is not None else []
-    blocks = block_request(options, config, sizes)
+    blocks = _request_of_run(task.run, task.scene, options)
     live = LiveSceneWriter(task.run, task.progress)
 
     def show_points(event: Event) -> None:
@@ -243,13 +243,26 @@ def _run_reconstruction(task: Task) -> None:
                 ),
                 should_stop=task.should_stop,
                 on_step=show_step,
-                # those that it was planned with, though this version may reckon memory otherwise
-                blocks=None if has_plan(task.run / BLOCKS) else blocks,
+                blocks=blocks,
                 start_from=task.begins_with,
                 given=given_settings(task.requested),
             )
     finally:
         _publish_run(task)
+
+
+def _request_of_run(run: Path, scene: Path, options: ReconstructJobConfig) -> BlockRequest | None:
+    """Return how a run is to be trained in blocks: one that goes on as it was begun.
+
+    This version may reckon otherwise how many Gaussians a memory holds.
+
+    Raises:
+        ConfigError: the memory holds no block, or what the run was begun with cannot be read.
+    """
+    if (run / CONFIG).exists():
+        return keep_request(run, None, is_new=False)
+    sizes = photograph_sizes(scene) if options.memory is not None else []
+    return block_request(options, options.run_config(), sizes)
 
 
 def _publish_run(task: Task) -> None:

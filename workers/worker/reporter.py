@@ -23,7 +23,7 @@ from octasplat.workers.queue.storage_leases import storage_lease
 from octasplat.workers.reporting.event_lines import EventLines
 from octasplat.workers.reporting.events import decode_event, encode_training_progress
 from octasplat.workers.reporting.time_left import TimeLeftEstimator, work_of_stage
-from octasplat.workers.storage.errors import StorageError
+from octasplat.workers.storage.trees import TREE_ERRORS
 from octasplat.workers.worker.checkpoint import Checkpoint
 from octasplat.workers.worker.task import (
     RUN_FOLDER,
@@ -267,7 +267,7 @@ class Reporter:
             self._preview = self._preview or preview
             self._live_scene = self._live_scene or live_scene
             raise
-        except (StorageError, *_IGNORED_ERRORS) as error:
+        except (*TREE_ERRORS, *_IGNORED_ERRORS) as error:
             logger.warning("a %s of job %s was not stored: %s", what, self._attempt.job.id, error)
             self.add_note(f"Warning: a {what} could not be stored: {error}")
             # A checkpoint is tried again with the next wish to store, unless that is for a newer checkpoint.
