@@ -12,6 +12,7 @@ from fastapi.responses import JSONResponse
 from psycopg_pool import PoolTimeout
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from starlette.exceptions import HTTPException
+from starlette.routing import Match
 
 from octasplat.engine.core.errors import OctasplatError
 from octasplat.engine.operations.base import error_text
@@ -215,15 +216,27 @@ async def _on_octasplat_error(_request: Request, error: Exception) -> JSONRespon
     return problem_from_error(error).response()
 
 
-async def _on_validation_error(_request: Request, error: Exception) -> JSONResponse:
+async def _on_validation_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
-    found = error.errors()
+    found = [_body_fault(request, fault) for fault in error.errors()]
     detail = "The request does not have the form that is asked for; see errors." + _unlisted(len(found))
     faults = [_field_error("", fault) for fault in found[:MAX_ERRORS]]
     return ProblemError(422, "request", detail, errors=faults).response()
 
 
-async def _on_http_exception(_request: Request, error: Exception) -> JSONResponse:
+def _body_fault(request: Request, fault: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return a fault of a request, in words of HTTP where the body as a whole could not be read."""
+    if fault["type"] == "json_invalid":  # its place is a position in the text, which no pointer can name
+        reason = f"{fault.get('ctx', {}).get('error', 'it breaks off')} at character {fault['loc'][-1]}"
+        return {**fault, "loc": ("body",), "msg": f"The body is no JSON: {reason}"}
+    is_json = "json" in request.headers.get("Content-Type", "")
+    if fault["loc"] == ("body",) and isinstance(fault.get("input"), bytes | str) and not is_json:
+        message = "The body is read as JSON only with the header Content-Type: application/json"
+        return {**fault, "type": "content_type", "msg": message}
+    return fault
+
+
+async def _on_http_exception(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, HTTPException)
     detail = {
         404: "There is nothing at this address.",
@@ -231,7 +244,16 @@ async def _on_http_exception(_request: Request, error: Exception) -> JSONRespons
         413: "The request is too long.",
     }.get(error.status_code, str(error.detail))
     code = HTTPStatus(error.status_code).phrase.lower().replace(" ", "-")
-    return ProblemError(error.status_code, code, detail, headers=error.headers).response()
+    headers = dict(error.headers or {})
+    if error.status_code == 405:
+        headers["Allow"] = ", ".join(_methods_of_address(request))
+    return ProblemError(error.status_code, code, detail, headers=headers).response()
+
+
+def _methods_of_address(request: Request) -> list[str]:
+    """Return all methods that an address takes, of which each has a route of its own."""
+    matching = (route for route in request.app.routes if route.matches(request.scope)[0] is not Match.NONE)
+    return sorted({method for route in matching for method in getattr(route, "methods", None) or ()})
 
 
 async def _on_database_error(_request: Request, error: Exception) -> JSONResponse:
@@ -281,6 +303,8 @@ def _field_error(prefix: str, fault: Mapping[str, Any]) -> dict[str, Any]:
         keys, message = stage_error({**fault, "loc": fault["loc"][1:]}, ("stage",))
         fault = {**fault, "loc": keys, "msg": message}
     where, *path = fault["loc"] or ("",)
+    if fault["type"] == "extra_forbidden" and not prefix and path:
+        fault = {**fault, "msg": f"There is no field '{path[-1]}' here"}
     if prefix:
         path = [where, *path]
         where = "body"
