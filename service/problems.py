@@ -252,8 +252,16 @@ async def _on_http_exception(request: Request, error: Exception) -> JSONResponse
 
 def _methods_of_address(request: Request) -> list[str]:
     """Return all methods that an address takes, of which each has a route of its own."""
-    matching = (route for route in request.app.routes if route.matches(request.scope)[0] is not Match.NONE)
-    return sorted({method for route in matching for method in getattr(route, "methods", None) or ()})
+    found: set[str] = set()
+    waiting = list(request.app.routes)
+    while waiting:
+        route = waiting.pop()
+        inner = getattr(route, "original_router", None)
+        if inner is not None:  # a router that was included, with its routes
+            waiting += inner.routes
+        elif route.matches(request.scope)[0] is not Match.NONE:
+            found.update(getattr(route, "methods", None) or ())
+    return sorted(found)
 
 
 async def _on_database_error(_request: Request, error: Exception) -> JSONResponse:
