@@ -17,6 +17,7 @@ from starlette.routing import Match
 from octasplat.engine.core.errors import OctasplatError
 from octasplat.engine.operations.base import error_text
 from octasplat.engine.pathtracing.stage.stage_errors import stage_error
+from octasplat.engine.settings.nearest_names import nearest_name
 from octasplat.engine.settings.refusals import InvalidSettingsError
 from octasplat.service.intake.faults import IntakeError
 from octasplat.service.request_id import current_request_id
@@ -130,8 +131,16 @@ def not_found_error(kind: str) -> ProblemError:
     return ProblemError(404, "not-found", f"There is no such {kind}.")
 
 
-def options_error(error: ValidationError | InvalidSettingsError, prefix: str = "/options") -> ProblemError:
-    """Return the problem of options that do not fit their schema."""
+def options_error(
+    error: ValidationError | InvalidSettingsError, known: Iterable[str] = (), prefix: str = "/options"
+) -> ProblemError:
+    """Return the problem of options that do not fit their schema.
+
+    Args:
+        error: what was refused.
+        known: names of the options, of which the one nearest to an unknown one is offered.
+        prefix: JSON pointer to the options in the request.
+    """
     if isinstance(error, InvalidSettingsError):
         faults = [
             {"code": each.code, "detail": each.sentence, "pointer": _pointer(prefix, each.path)}
@@ -144,7 +153,8 @@ def options_error(error: ValidationError | InvalidSettingsError, prefix: str = "
         f"{error.error_count()} of the options cannot be used; see errors, and GET /v1/options."
         + _unlisted(error.error_count()),
         errors=_distinct(
-            _field_error(prefix, fault) for fault in error.errors(include_url=False)[:MAX_ERRORS]
+            _field_error(prefix, _with_nearest(fault, known))
+            for fault in error.errors(include_url=False)[:MAX_ERRORS]
         ),
     )
 
@@ -303,6 +313,15 @@ def _distinct(faults: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
     for fault in faults:
         found.setdefault((fault["detail"], str(fault.get("pointer"))), fault)
     return list(found.values())
+
+
+def _with_nearest(fault: Mapping[str, Any], known: Iterable[str]) -> Mapping[str, Any]:
+    """Return a fault, in which an unknown option is answered with the nearest one."""
+    if fault["type"] != "extra_forbidden" or len(fault["loc"]) != 1:
+        return fault
+    nearest = nearest_name(str(fault["loc"][0]), known)
+    more = f"; the nearest is {nearest}" if nearest else ""
+    return {**fault, "msg": f"There is no such option{more}"}
 
 
 def _field_error(prefix: str, fault: Mapping[str, Any]) -> dict[str, Any]:

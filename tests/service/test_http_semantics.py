@@ -286,6 +286,10 @@ async def test_bodies_that_cannot_be_read_are_refused_in_words_of_http(
         assert fault == {
             "code": "extra_forbidden", "detail": "There is no field 'dataset' here", "pointer": "#/dataset",
         }  # fmt: skip
+        option = await http.post("/v1/estimates", json={"kind": "render", "options": {"frame": 60}})
+        (fault,) = option.json()["errors"]
+        assert fault["detail"] == "There is no such option; the nearest is frames"
+        assert fault["pointer"] == "#/options/frame"
 
 
 async def test_refused_method_is_answered_with_all_that_the_address_takes(
