@@ -68,8 +68,9 @@ class PinholeCamera:
             ConfigError: the pose is no rotation with a place, the image has no pixels, or a focal length is
                 not above 0.
 
-        >>> PinholeCamera.from_pose(np.eye(4), 96, 64, fy_px=80).centre_world
-        array([-0., -0., -0.])
+        >>> pose = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -4]]
+        >>> PinholeCamera.from_pose(pose, 96, 64, fy_px=80).centre_world
+        array([ 0.,  0., -4.])
         """
         pose = _checked_pose(world_from_cam)
         if not (width_px >= 1 and height_px >= 1):
