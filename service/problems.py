@@ -12,10 +12,12 @@ from fastapi.responses import JSONResponse
 from psycopg_pool import PoolTimeout
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from starlette.exceptions import HTTPException
+from starlette.routing import Match
 
 from octasplat.engine.core.errors import OctasplatError
 from octasplat.engine.operations.base import error_text
 from octasplat.engine.pathtracing.stage.stage_errors import stage_error
+from octasplat.engine.settings.nearest_names import nearest_name
 from octasplat.engine.settings.refusals import InvalidSettingsError
 from octasplat.service.intake.faults import IntakeError
 from octasplat.service.request_id import current_request_id
@@ -129,8 +131,16 @@ def not_found_error(kind: str) -> ProblemError:
     return ProblemError(404, "not-found", f"There is no such {kind}.")
 
 
-def options_error(error: ValidationError | InvalidSettingsError, prefix: str = "/options") -> ProblemError:
-    """Return the problem of options that do not fit their schema."""
+def options_error(
+    error: ValidationError | InvalidSettingsError, known: Iterable[str] = (), prefix: str = "/options"
+) -> ProblemError:
+    """Return the problem of options that do not fit their schema.
+
+    Args:
+        error: what was refused.
+        known: names of the options, of which the one nearest to an unknown one is offered.
+        prefix: JSON pointer to the options in the request.
+    """
     if isinstance(error, InvalidSettingsError):
         faults = [
             {"code": each.code, "detail": each.sentence, "pointer": _pointer(prefix, each.path)}
@@ -143,7 +153,8 @@ def options_error(error: ValidationError | InvalidSettingsError, prefix: str = "
         f"{error.error_count()} of the options cannot be used; see errors, and GET /v1/options."
         + _unlisted(error.error_count()),
         errors=_distinct(
-            _field_error(prefix, fault) for fault in error.errors(include_url=False)[:MAX_ERRORS]
+            _field_error(prefix, _with_nearest(fault, known))
+            for fault in error.errors(include_url=False)[:MAX_ERRORS]
         ),
     )
 
@@ -215,15 +226,27 @@ async def _on_octasplat_error(_request: Request, error: Exception) -> JSONRespon
     return problem_from_error(error).response()
 
 
-async def _on_validation_error(_request: Request, error: Exception) -> JSONResponse:
+async def _on_validation_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
-    found = error.errors()
+    found = [_body_fault(request, fault) for fault in error.errors()]
     detail = "The request does not have the form that is asked for; see errors." + _unlisted(len(found))
     faults = [_field_error("", fault) for fault in found[:MAX_ERRORS]]
     return ProblemError(422, "request", detail, errors=faults).response()
 
 
-async def _on_http_exception(_request: Request, error: Exception) -> JSONResponse:
+def _body_fault(request: Request, fault: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return a fault of a request, in words of HTTP where the body as a whole could not be read."""
+    if fault["type"] == "json_invalid":  # its place is a position in the text, which no pointer can name
+        reason = f"{fault.get('ctx', {}).get('error', 'it breaks off')} at character {fault['loc'][-1]}"
+        return {**fault, "loc": ("body",), "msg": f"The body is no JSON: {reason}"}
+    is_json = "json" in request.headers.get("Content-Type", "")
+    if fault["loc"] == ("body",) and isinstance(fault.get("input"), bytes | str) and not is_json:
+        message = "The body is read as JSON only with the header Content-Type: application/json"
+        return {**fault, "type": "content_type", "msg": message}
+    return fault
+
+
+async def _on_http_exception(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, HTTPException)
     detail = {
         404: "There is nothing at this address.",
@@ -231,7 +254,24 @@ async def _on_http_exception(_request: Request, error: Exception) -> JSONRespons
         413: "The request is too long.",
     }.get(error.status_code, str(error.detail))
     code = HTTPStatus(error.status_code).phrase.lower().replace(" ", "-")
-    return ProblemError(error.status_code, code, detail, headers=error.headers).response()
+    headers = dict(error.headers or {})
+    if error.status_code == 405:
+        headers["Allow"] = ", ".join(_methods_of_address(request))
+    return ProblemError(error.status_code, code, detail, headers=headers).response()
+
+
+def _methods_of_address(request: Request) -> list[str]:
+    """Return all methods that an address takes, of which each has a route of its own."""
+    found: set[str] = set()
+    waiting = list(request.app.routes)
+    while waiting:
+        route = waiting.pop()
+        inner = getattr(route, "original_router", None)
+        if inner is not None:  # a router that was included, with its routes
+            waiting += inner.routes
+        elif route.matches(request.scope)[0] is not Match.NONE:
+            found.update(getattr(route, "methods", None) or ())
+    return sorted(found)
 
 
 async def _on_database_error(_request: Request, error: Exception) -> JSONResponse:
@@ -275,12 +315,23 @@ def _distinct(faults: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
     return list(found.values())
 
 
+def _with_nearest(fault: Mapping[str, Any], known: Iterable[str]) -> Mapping[str, Any]:
+    """Return a fault, in which an unknown option is answered with the nearest one."""
+    if fault["type"] != "extra_forbidden" or len(fault["loc"]) != 1:
+        return fault
+    nearest = nearest_name(str(fault["loc"][0]), known)
+    more = f"; the nearest is {nearest}" if nearest else ""
+    return {**fault, "msg": f"There is no such option{more}"}
+
+
 def _field_error(prefix: str, fault: Mapping[str, Any]) -> dict[str, Any]:
     is_unknown = fault["type"] == "extra_forbidden" and len(fault["loc"]) == 1  # of a kind without stages
     if fault["loc"][:1] == ("stage",) and not is_unknown:  # told as whoever reads a stage file would be told
         keys, message = stage_error({**fault, "loc": fault["loc"][1:]}, ("stage",))
         fault = {**fault, "loc": keys, "msg": message}
     where, *path = fault["loc"] or ("",)
+    if fault["type"] == "extra_forbidden" and not prefix and path:
+        fault = {**fault, "msg": f"There is no field '{path[-1]}' here"}
     if prefix:
         path = [where, *path]
         where = "body"

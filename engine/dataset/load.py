@@ -104,7 +104,7 @@ def require_masks(model: DatasetModel) -> None:
 def _check_root(root: Path, *, has_found_model: bool) -> None:
     """Refuse a folder without photographs, or without poses unless a model was found for it."""
     if not root.is_dir():
-        raise DatasetError(f"{root} is not a folder; name the folder that holds images/ and sparse/.")
+        raise DatasetError(f"{root} is not a folder; name the folder that holds the photographs.")
     if (
         not has_found_model
         and image_folder(root) == root

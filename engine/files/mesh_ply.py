@@ -68,10 +68,12 @@ def read(path: Path) -> ImportedMesh:
         raise SceneFileError(
             f"{path}: is a file of Gaussians, not a mesh; name the mesh that was exported and edited."
         )
-    missing = [name for name in _POSITION if name not in vertex.names]
-    if missing or vertex.lists:
+    # Some programs write colors and the like as lists, which nothing here needs.
+    numbers = [prop.name for prop in vertex.properties if prop.count_kind is None]
+    missing = [name for name in _POSITION if name not in numbers]
+    if missing:
         raise SceneFileError(f"{path}: is no mesh; its vertices lack the property {', '.join(missing)}.")
-    table = tables["vertex"]
+    table = tables["vertex"][numbers]
     face = header.element("face")
     positions = np.empty((len(table), 3))
     for axis, coordinate in enumerate(_POSITION):
@@ -86,7 +88,7 @@ def read(path: Path) -> ImportedMesh:
     return ImportedMesh(
         positions,
         triangles,
-        uv=columns(table, ("s", "t")) if {"s", "t"} <= set(vertex.names) else None,
+        uv=columns(table, ("s", "t")) if {"s", "t"} <= set(numbers) else None,
         gid=_find_attribute(table, "gid"),
         corner=_find_attribute(table, "corner"),
         radius=_find_attribute(table, "radius"),
@@ -105,8 +107,10 @@ def read_with_materials(path: Path) -> ImportedMesh:
     mesh = read(path)
     if mesh.triangles.max(initial=-1) >= len(mesh):
         return mesh  # damaged, which is told for all formats alike
-    table = read_ply(path, ["vertex"])[1]["vertex"]
-    names = set(table.dtype.names or ())
+    header, tables = read_ply(path, ["vertex"])
+    table, vertex = tables["vertex"], header.element("vertex")
+    assert vertex is not None
+    names = {prop.name for prop in vertex.properties if prop.count_kind is None}
     uv = mesh.uv
     if uv is None and {"u", "v"} <= names:  # other programs' names of s and t
         uv = columns(table, ("u", "v"))

@@ -15,6 +15,7 @@ from octasplat.engine.core.events import Event, EventListener, Warned, ignore_ev
 from octasplat.engine.operations.precompile import compile_beside, request_groups
 from octasplat.engine.settings import renamed_settings
 from octasplat.engine.settings.fields import Output, Positional, Source
+from octasplat.engine.settings.refusals import fault_message
 
 
 class Options(BaseModel):
@@ -227,7 +228,7 @@ def first_error(error: ValidationError, place: Callable[[str], str] = lambda pat
     """Return the first complaint of a validation as one sentence that names the field."""
     first = error.errors()[0]
     path = ".".join(str(part) for part in first["loc"])
-    message = error_text(first["msg"], place)
+    message = error_text(fault_message(first), place)
     return f"{place(path)}: {message}." if path else f"{message}."
 
 

@@ -13,6 +13,8 @@ from octasplat.engine.dataset.images import read_image_info, read_photo
 
 MIN_RECOMMENDED_SIDE_PX = 480
 """Below this, what COLMAP finds was seen to be wrong without any sign of it."""
+MAX_NAMED = 20
+"""Most damaged photographs that are named."""
 DECODING_BYTES = 2 << 30
 """Memory that decoding threads may take together; one thread always runs."""
 
@@ -35,7 +37,8 @@ def check_photographs_decode(
         on_count: hears of photographs.
 
     Raises:
-        DatasetError: a file is damaged or cut short.
+        DatasetError: files are damaged or cut short; all of them are named, so that they can be replaced or
+            taken away in one go.
     """
     sizes = []
     for name in names:
@@ -55,11 +58,25 @@ def check_photographs_decode(
     with ThreadPoolExecutor(workers) as pool:
         futures = [pool.submit(read, file) for file in sizes]
         try:
+            faults = []
             for done, future in enumerate(futures, start=1):
-                future.result()
+                try:
+                    future.result()
+                except DatasetError as error:
+                    faults.append((sizes[done - 1][0], error))
                 on_count(done)
         finally:
             pool.shutdown(cancel_futures=True)
+    if len(faults) == 1:
+        # The reason of a single one is told, too.
+        raise DatasetError(f"{str(faults[0][1]).removesuffix('.')}, or take it out of the folder.")
+    if faults:
+        damaged = [path.relative_to(folder).as_posix() for path, _ in faults]
+        more = f" and {len(damaged) - MAX_NAMED} more" if len(damaged) > MAX_NAMED else ""
+        raise DatasetError(
+            f"{len(damaged)} photographs of {folder} are damaged or cut short "
+            f"({', '.join(damaged[:MAX_NAMED])}{more}); replace the files, or take them out of the folder."
+        )
 
 
 def read_image_infos(images: Path, names: Sequence[str]) -> dict[str, ImageInfo]:

@@ -6,9 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Float64
+from numpy.typing import ArrayLike
 
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.rays import ImageRays
+
+_POSE_ERROR = 1e-2
+"""Most by which rotation times its transpose may differ from the identity."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,7 @@ class PinholeCamera:
     @classmethod
     def from_pose(
         cls,
-        world_from_cam: Float64[np.ndarray, "4 4"],
+        world_from_cam: ArrayLike,
         width_px: int,
         height_px: int,
         *,
@@ -49,8 +53,33 @@ class PinholeCamera:
         cx_px: float | None = None,
         cy_px: float | None = None,
     ) -> "PinholeCamera":
-        """Return a camera at a pose (camera-to-world matrix)."""
-        rotation = world_from_cam[:3, :3].T
+        """Return a camera at a pose.
+
+        Args:
+            world_from_cam: camera-to-world matrix; its lowest row may be left out.
+            width_px: image width.
+            height_px: image height.
+            fy_px: focal length down.
+            fx_px: focal length across; by default ``fy_px``.
+            cx_px: principal point from the left edge; by default the middle.
+            cy_px: principal point from the top edge; by default the middle.
+
+        Raises:
+            ConfigError: the pose is no rotation with a place, the image has no pixels, or a focal length is
+                not above 0.
+
+        >>> pose = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -4]]
+        >>> PinholeCamera.from_pose(pose, 96, 64, fy_px=80).centre_world
+        array([ 0.,  0., -4.])
+        """
+        pose = _checked_pose(world_from_cam)
+        if not (width_px >= 1 and height_px >= 1):
+            raise ConfigError(
+                f"An image of {width_px} x {height_px} pixels has none; both must be at least 1."
+            )
+        if not (fy_px > 0 and (fx_px is None or fx_px > 0)):
+            raise ConfigError("A focal length must be above 0 px.")
+        rotation = pose[:3, :3].T
         return cls(
             width_px=width_px,
             height_px=height_px,
@@ -59,7 +88,7 @@ class PinholeCamera:
             cx_px=width_px / 2 if cx_px is None else cx_px,
             cy_px=height_px / 2 if cy_px is None else cy_px,
             rotation_cam_from_world=np.ascontiguousarray(rotation),
-            translation_cam_from_world=-rotation @ world_from_cam[:3, 3],
+            translation_cam_from_world=-rotation @ pose[:3, 3],
         )
 
     @classmethod
@@ -77,7 +106,7 @@ class PinholeCamera:
 
         Raises:
             ConfigError: it stands in its target, looks along the up direction, or is no camera by its size or
-                its field of view.
+                its field of view; or a point is none.
 
         >>> PinholeCamera.looking_at((0, 0, -4), (0, 0, 0), 96, 64).centre_world
         array([ 0.,  0., -4.])
@@ -88,6 +117,8 @@ class PinholeCamera:
         position, target, up = (
             np.array(vector, np.float64) for vector in (position_world, target_world, up_world)
         )
+        if not all(point.shape == (3,) and np.isfinite(point).all() for point in (position, target, up)):
+            raise ConfigError("A position, a target and an up direction each have three finite numbers.")
         focal_px = focal_from_fov(fov_y_degrees, height_px)
         return cls.from_pose(look_at(position, target, up), width_px, height_px, fy_px=focal_px)
 
@@ -123,6 +154,25 @@ class PinholeCamera:
         depth = np.where(points_cam[:, 2] > 0, points_cam[:, 2], np.nan)
         across = self.fx_px * points_cam[:, 0] / depth + self.cx_px
         return np.stack([across, self.fy_px * points_cam[:, 1] / depth + self.cy_px], axis=-1)
+
+
+def _checked_pose(world_from_cam: ArrayLike) -> Float64[np.ndarray, "r 4"]:
+    """Return a pose as float64; refuses what is no rotation with a place."""
+    try:
+        pose = np.array(world_from_cam, np.float64)
+    except (TypeError, ValueError):
+        pose = np.zeros(0)
+    if pose.shape not in ((4, 4), (3, 4)):
+        raise ConfigError("world_from_cam: must be a 4 x 4 or 3 x 4 matrix of numbers.")
+    rotation = pose[:3, :3]
+    # Poses in float32 and rounded ones pass.
+    is_rotation = np.isfinite(pose).all() and np.abs(rotation @ rotation.T - np.eye(3)).max() < _POSE_ERROR
+    if not is_rotation or np.linalg.det(rotation) < 0:
+        raise ConfigError(
+            "world_from_cam: must hold a rotation without scale or mirroring and the camera's place, from "
+            "the camera to the world, where x points right, y down and z forward."
+        )
+    return pose
 
 
 def check_lens(width_px: int, height_px: int, fov_y_degrees: float) -> None:

@@ -52,6 +52,25 @@ def refusals_from(error: ValidationError, model: type[BaseModel]) -> list[Refusa
     return list(found.values())
 
 
+def fault_message(fault: Mapping[str, Any]) -> str:
+    """Return what ails a value, without its name and a full stop, in words that pydantic may lack.
+
+    Args:
+        fault: one of the errors of a ``ValidationError``.
+    """
+    given = type(fault.get("input")).__name__
+    if fault["type"] in ("path_type", "is_instance_of") and "Path" in str(fault["msg"]):
+        hint = "; write the scene to a file first (octasplat.save)" if given == "Scene" else ""
+        return f"must be the path of a file or folder, not {_with_article(given)}{hint}"
+    if fault["type"] in ("tuple_type", "list_type"):
+        return f"must be a list, not {_with_article(given)}"
+    return str(fault["msg"]).removeprefix("Value error, ").removesuffix(".")
+
+
+def _with_article(name: str) -> str:
+    return f"{'an' if name[:1].lower() in 'aeiou' else 'a'} {name}"
+
+
 def refuse_unknown_setting(
     path: Sequence[str | int],
     known: Iterable[str],
@@ -97,7 +116,7 @@ def _fault_sentence(path: Sequence[str | int], fault: Mapping[str, Any]) -> str:
     is_ours = fault["type"] == "value_error"
     # such a sentence names the settings itself
     name = "" if is_ours and tuple(path) == ("train",) else setting_name(path)
-    message = str(fault["msg"]).removeprefix("Value error, ").removesuffix(".")
+    message = fault_message(fault)
     value = fault.get("input")
     shows_value = not is_ours and (isinstance(value, str | int | float | bool) or value is None)
     value_text = f" (it is {value!r})" if shows_value and len(repr(value)) <= _LONGEST_VALUE else ""

@@ -76,7 +76,7 @@ def _resolve(kind: JobKind, values: Mapping[str, Any]) -> ResolvedOptions:
         complete = resolve_requested(kind, values)
         return ResolvedOptions(complete, requested_options(kind, values, complete))
     except (ValidationError, InvalidSettingsError) as error:
-        raise options_error(error) from None
+        raise options_error(error, kind.user_options.model_fields) from None
 
 
 def _revise(
@@ -90,7 +90,7 @@ def _revise(
         # A job that begins anew gets the presets and defaults of this version.
         return ResolvedOptions(revised if is_resumed else resolve_requested(kind, requested), requested)
     except (ValidationError, InvalidSettingsError) as error:
-        raise options_error(error) from None
+        raise options_error(error, kind.user_options.model_fields) from None
 
 
 def input_problem(name: str, detail: str) -> ProblemError:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 from octasplat.engine import __version__
 
 if TYPE_CHECKING:
-    from octasplat.client import Client, Job
+    from octasplat.client import Client, Job, JobFailedError, ServiceError
     from octasplat.engine.core.errors import CancelledError, ConfigError, OctasplatError
     from octasplat.engine.render.pinhole_camera import PinholeCamera as Camera
     from octasplat.engine.trace.protocol import TraceSettings
@@ -58,10 +58,12 @@ _SOURCES = {
     "GaussianTensors": ("tracing", "GaussianTensors"),
     "Image": ("images", "Image"),
     "Job": ("client", "Job"),
+    "JobFailedError": ("client", "JobFailedError"),
     "OctasplatError": ("engine.core.errors", "OctasplatError"),
     "Rays": ("tracing", "Rays"),
     "Run": ("runs", "Run"),
     "Scene": ("scenes", "Scene"),
+    "ServiceError": ("client", "ServiceError"),
     "TraceSettings": ("engine.trace.protocol", "TraceSettings"),
     "TracedRays": ("tracing", "TracedRays"),
     "Viewer": ("viewer", "Viewer"),
@@ -99,10 +101,12 @@ __all__ = [
     "GaussianTensors",
     "Image",
     "Job",
+    "JobFailedError",
     "OctasplatError",
     "Rays",
     "Run",
     "Scene",
+    "ServiceError",
     "TraceSettings",
     "TracedRays",
     "Viewer",

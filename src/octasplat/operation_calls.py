@@ -5,9 +5,10 @@ import inspect
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar, get_args, get_origin
 
-from pydantic import BaseModel
+from pydantic import BaseModel, BeforeValidator
+from pydantic.fields import FieldInfo
 
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.events import EventListener
@@ -75,6 +76,8 @@ def run_operation(
         ConfigError: a value cannot be used; the sentence is that of the command.
         OctasplatError: as the operation does.
     """
+    if threads < 0:
+        raise ConfigError(f"threads: must be 0, which takes all cores, or more (it is {threads}).")
     verb = operation(name)
     request = build_request(verb.request, explicit_values(verb.request, values))
     result = verb.execute(
@@ -87,15 +90,32 @@ def run_operation(
 def explicit_values(model: type[BaseModel], values: Mapping[str, Any]) -> dict[str, Any]:
     """Return those values of a model's fields that a caller gave, as the model takes them.
 
-    None counts as not given, and so does a boolean that is the default, unless it can be said.
+    None counts as not given, and so does a boolean that is the default, unless it can be said. One value
+    where several may be given counts as the only one.
     """
     fields = model.model_fields
     return {
-        name: _to_plain_value(value)
+        name: _as_several(fields[name], _to_plain_value(value))
         for name, value in values.items()
         if value is not None
         and not (isinstance(value, bool) and value is fields[name].default and not is_negatable(fields[name]))
     }
+
+
+def _as_several(field: FieldInfo, value: Any) -> Any:
+    """Return a value alone as the only one of a field that takes any number of them."""
+    # Such a field reads texts by itself.
+    if any(isinstance(mark, BeforeValidator) for mark in field.metadata):
+        return value
+    for annotation in (field.annotation, *get_args(field.annotation)):
+        inner = get_args(annotation)
+        if get_origin(annotation) is not tuple or inner[-1:] != (Ellipsis,):
+            continue
+        # Of a list of pairs, such as axes and angles, one pair is a tuple itself.
+        is_pair = get_origin(inner[0]) is tuple and isinstance(value, tuple) and len(value) > 0
+        if isinstance(value, str | Path) or (is_pair and not isinstance(value[0], tuple)):
+            return (value,)
+    return value
 
 
 def _to_plain_value(value: Any) -> Any:

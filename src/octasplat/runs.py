@@ -4,7 +4,9 @@ import json
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from octasplat.engine.core.errors import CancelledError, ConfigError
 from octasplat.engine.core.events import Event, EventListener, TrainingProgress
@@ -12,6 +14,9 @@ from octasplat.notebook import default_progress, table_html
 from octasplat.operation_calls import explicit_values, run_operation
 from octasplat.paths import PathLike
 from octasplat.scenes import Scene, load
+
+if TYPE_CHECKING:
+    from octasplat.engine.render.pinhole_camera import PinholeCamera
 
 _CONFIG, _METRICS, _REPORT, _SCENE, _TRAINING = (
     "config.json", "metrics.json", "report.html", "scene.ply", "training.json",
@@ -110,6 +115,35 @@ class Run:
         """Return the metrics of each held-out view, by the name of its photograph."""
         found: Mapping[str, Mapping[str, float]] = self.metrics.get("views", {})
         return found
+
+    @property
+    def cameras(self) -> Mapping[str, "PinholeCamera"]:
+        """Return where each photograph was taken from, by its name, held out or not.
+
+        With such a camera :func:`octasplat.render` shows the run's scene as in the photograph. Lenses with
+        distortion are replaced by pinholes that show what lies between the middles of the image's sides, a
+        panorama by one that looks ahead.
+
+        Raises:
+            OctasplatError: the run keeps no cameras, as runs of old, and its photographs cannot be read.
+
+        >>> import octasplat as osp
+        >>> run = osp.Run("run")
+        >>> camera = run.cameras["view_000.png"]
+        >>> osp.render(run.scene, camera).rgb.shape == (camera.height_px, camera.width_px, 3)
+        True
+        """
+        from octasplat.engine.runs.run_folder import run_min_view_distance, run_viewpoints
+        from octasplat.engine.surface.depth_cameras import photograph_cameras
+
+        found = run_viewpoints(self.path)
+        near = run_min_view_distance(self.path, found)
+        sizes = [max(view.width_px, view.height_px) for view in found.views]
+        return {
+            # Of a panorama, which has six, the one ahead.
+            view.name: photograph_cameras(found, np.array([index]), size, near)[0]
+            for index, (view, size) in enumerate(zip(found.views, sizes, strict=True))
+        }
 
     @property
     def settings(self) -> Mapping[str, Any]:

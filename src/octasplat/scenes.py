@@ -19,6 +19,7 @@ from octasplat.notebook import log_event, table_html
 from octasplat.paths import PathLike
 
 if TYPE_CHECKING:
+    from octasplat.engine.dataset import Viewpoints
     from octasplat.engine.render.pinhole_camera import PinholeCamera
     from octasplat.engine.shading.deferred import DeferredShading
     from octasplat.engine.trace.protocol import TraceSettings
@@ -47,6 +48,7 @@ class Scene:
         facts: SceneMetadata = UNKNOWN_METADATA,
         materials: "DeferredShading | None" = None,
         trained_with: "TraceSettings | None" = None,
+        viewpoints: "Viewpoints | None" = None,
     ) -> None:
         """Take over the engine's Gaussians; :meth:`from_arrays` makes a scene of plain arrays.
 
@@ -55,11 +57,13 @@ class Scene:
             facts: what a file says of it as a whole.
             materials: shading of its materials in the light that a run has learnt.
             trained_with: how a run has traced it; None where that is not known.
+            viewpoints: where its photographs were taken from; None where that is not known.
         """
         self.gaussians = gaussians
         self.facts = facts
         self.materials = materials
         self.trained_with = trained_with
+        self.viewpoints = viewpoints
 
     @classmethod
     def from_arrays(
@@ -193,11 +197,14 @@ class Scene:
         >>> len(scene.select(scene.opacities > 0.5)) < len(scene)
         True
         """
-        return Scene(self.gaussians.select(index), self.facts, self.materials, self.trained_with)
+        return self._with(self.gaussians.select(index))
 
     def copy(self) -> "Scene":
         """Return an independent copy."""
-        return Scene(self.gaussians.copy(), self.facts, self.materials, self.trained_with)
+        return self._with(self.gaussians.copy())
+
+    def _with(self, gaussians: FlatGaussians) -> "Scene":
+        return Scene(gaussians, self.facts, self.materials, self.trained_with, self.viewpoints)
 
     @property
     def trace_settings(self) -> "TraceSettings":
@@ -206,10 +213,8 @@ class Scene:
 
         return self.trained_with or TraceSettings(flip_normal_cos=self.facts.turned_beyond)
 
-    def camera(self, width: int = 640, height: int = 480, *, fov: float = 50.0) -> "PinholeCamera":
-        """Return a camera that sees the whole scene; ``fov`` is its angle of view in degrees, down.
-
-        It sees nothing nearer than the scene's file says, as in :func:`octasplat.render` of that file.
+    def camera(self, width: int = 640, height: int = 480, *, fov: float | None = None) -> "PinholeCamera":
+        """Return the first camera of :meth:`turntable`.
 
         >>> import octasplat as osp
         >>> camera = osp.load("scene.ply").camera(width=96, height=64)
@@ -219,11 +224,19 @@ class Scene:
         return self.turntable(1, width, height, fov=fov)[0]
 
     def turntable(
-        self, frames: int, width: int = 640, height: int = 480, *, fov: float = 50.0
+        self, frames: int, width: int = 640, height: int = 480, *, fov: float | None = None
     ) -> tuple["PinholeCamera", ...]:
-        """Return cameras that go round the scene once, with -y up as in most scenes that COLMAP made.
+        """Return cameras that go round the scene once, as those of :func:`octasplat.render` do.
 
-        They see nothing nearer than the scene's file says.
+        The scene of a run is seen from where its photographs were taken, about, which also say what is up. Of
+        others the whole scene is seen, with -y up as in most scenes that COLMAP made. Nothing is seen nearer
+        than the scene's file says.
+
+        Args:
+            frames: how many cameras.
+            width: of their images, px.
+            height: of their images, px.
+            fov: angle of view from top to bottom, degrees; by default that of the photographs, or 50.
 
         Raises:
             ConfigError: there are no frames, or an image has no pixels or no field of view.
@@ -232,12 +245,19 @@ class Scene:
         >>> len(osp.load("scene.ply").turntable(12))
         12
         """
+        from octasplat.engine.render.orbit import Orbit, PinholeLens, choose_fov_y_degrees, orbit_cameras
         from octasplat.engine.render.pinhole_camera import check_lens
-        from octasplat.engine.render.shots import gaussian_turntable, turntable_cameras
 
-        check_lens(width, height, fov)
-        table = gaussian_turntable(self.gaussians, fov_y_degrees=fov, aspect=width / height)
-        cameras = turntable_cameras(table, frames, width, height, fov)
+        angle = choose_fov_y_degrees(fov, self.viewpoints)
+        check_lens(width, height, angle)
+        lens, orbit = PinholeLens(width, height, angle), Orbit(np.array([0.0, -1.0, 0.0]))
+        try:
+            cameras = orbit_cameras(self.gaussians, self.viewpoints, lens, orbit, frames)
+        except ConfigError:
+            if self.viewpoints is None:
+                raise
+            # Photographs that share no up direction go round nothing.
+            cameras = orbit_cameras(self.gaussians, None, lens, orbit, frames)
         return tuple(replace(camera, near_world=self.facts.near_world) for camera in cameras)
 
     def __len__(self) -> int:
@@ -309,9 +329,9 @@ def _opacity_logits(opacities: Float[np.ndarray, "..."]) -> Float64[np.ndarray, 
 def load(source: PathLike, *, drop_invalid: bool = False) -> Scene:
     """Return the scene of a file of any format, or of a run.
 
-    With a run comes how it has traced rays, and the light that it has learnt, if it has materials;
-    :func:`octasplat.render` shows them in it. What reading loses, as the thickness of Gaussians that were
-    not flat, is logged.
+    With a run comes where its photographs were taken from, how it has traced rays, and the light that it has
+    learnt, if it has materials; :func:`octasplat.render` shows them in it. What reading loses, as the
+    thickness of Gaussians that were not flat, is logged.
 
     Args:
         source: the file, a run or its folder, or the folder of an unpacked SOG.
@@ -339,12 +359,14 @@ def read_scene(path: Path, progress: EventListener, *, drop_invalid: bool = Fals
     from octasplat.engine.operations.scene_io import open_scene
     from octasplat.engine.runs.config import read_config
     from octasplat.engine.runs.finished_shading import learned_materials
-    from octasplat.engine.runs.run_folder import CONFIG, is_full_run
+    from octasplat.engine.runs.run_folder import CONFIG, VIEWS, is_full_run, run_viewpoints
 
     gaussians = open_scene(path, progress, drop_invalid=drop_invalid)
     materials = learned_materials(path, gaussians)
     settings = read_config(path / CONFIG).train.trace if is_full_run(path) else None
-    return Scene(gaussians, read_metadata(path), materials, settings)
+    # Runs of old keep no cameras, and their photographs may be anywhere.
+    viewpoints = run_viewpoints(path) if settings is not None and (path / VIEWS).exists() else None
+    return Scene(gaussians, read_metadata(path), materials, settings, viewpoints)
 
 
 def save(scene: Scene, path: PathLike) -> Path:
@@ -354,6 +376,7 @@ def save(scene: Scene, path: PathLike) -> Path:
 
     Raises:
         SceneFileError: no format has that suffix, or the file cannot be written.
+        TypeError: what is given is no scene.
 
     >>> import octasplat as osp
     >>> osp.save(osp.load("scene.ply"), "smaller.spz").name
@@ -363,6 +386,8 @@ def save(scene: Scene, path: PathLike) -> Path:
     """
     from octasplat.engine.operations.scene_io import write_scene
 
+    if not isinstance(scene, Scene):
+        raise TypeError(f"save takes a scene, not {scene!r}; load() gives that of a file or run")
     target = Path(path)
     write_scene(scene.gaussians, scene.facts, target, log_event)
     return target

@@ -143,7 +143,7 @@ def test_scene_of_run_is_traced_as_the_run_was(finished_run: Path, tmp_path: Pat
     content["reconstruction"]["train"]["trace"] |= {"q": 4.0, "transmittance_min": 0.3}
     (run / "config.json").write_text(json.dumps(content))
     scene = osp.load(run)
-    camera = scene.camera(width=48, height=36)
+    camera = scene.camera(width=48, height=36, fov=50.0)
     pose = {"camera_to_world": camera.world_from_cam.tolist(), "fov_y_degrees": 50.0}
     path = {"width": 48, "height": 36, "frames": [pose]}
     osp.render(run, tmp_path / "shown.exr", camera_path=path, background="black")
@@ -175,3 +175,24 @@ def test_viewer_of_run_has_cameras(finished_run: Path) -> None:
 def test_resume_ignores_empty_settings(photographs: Path, finished_run: Path) -> None:
     run = osp.reconstruct(photographs, finished_run, resume=True, train={}, assignments=[])
     assert run.is_finished
+
+
+def test_scene_of_a_run_is_seen_as_its_photographs_and_the_command_show_it(
+    finished_run: Path, tmp_path: Path
+) -> None:
+    options = {"mode": "turntable", "frames": 2, "width_px": 48, "height_px": 36}
+    osp.render(finished_run, tmp_path / "frames", **options)
+    scene = osp.load(finished_run)
+    cameras = scene.select(slice(None)).copy().turntable(2, 48, 36)
+    for camera, frame in zip(cameras, sorted((tmp_path / "frames").rglob("*.png")), strict=True):
+        np.testing.assert_allclose(osp.render(scene, camera).rgb, read_image(frame)[..., :3], atol=0.6 / 255)
+    # The still life has z up, and a scene of COLMAP would have -y.
+    assert -scene.camera().rotation_cam_from_world[1] @ (0, 0, 1) > 0.8
+
+
+def test_scene_is_rendered_from_where_a_photograph_was_taken(finished_run: Path) -> None:
+    run = osp.Run(finished_run)
+    assert len(run.cameras) == 9
+    seen = osp.render(run.scene, run.cameras["view_008.png"]).rgb
+    stored = read_image(finished_run / "renders" / "view_008.png")[..., :3]
+    np.testing.assert_allclose(seen, stored, atol=0.6 / 255)

@@ -152,3 +152,32 @@ def test_split_sum_reports_sample_count(in_folder: Path) -> None:
     told.clear()
     osp.relight("shiny.ply", "b.png", environments=["studio.hdr"], samples=9, **one)
     assert not any(isinstance(event, Warned) for event in told)
+
+
+def test_value_alone_stands_for_the_only_one(scene_file: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.ply"
+    shutil.copy(scene_file, other)
+    assert osp.merge(scene_file, tmp_path / "both.ply", other).counts == (1200, 1200)
+    assert osp.merge(scene_file, tmp_path / "both.ply", str(other)).counts == (1200, 1200)
+    turned = osp.transform(scene_file, tmp_path / "turned.ply", rotate=("x", 90))
+    np.testing.assert_allclose(turned.matrix[1], (0, 0, -1, 0), atol=1e-12)
+    given = explicit_values(
+        operation("reconstruct").request, {"held_out": "view_003.png", "exports": "a.spz"}
+    )
+    assert given == {"held_out": ("view_003.png",), "exports": "a.spz"}
+
+
+def test_values_of_another_kind_are_refused_in_plain_words(scene_file: Path, tmp_path: Path) -> None:
+    scene, target = osp.load(scene_file), tmp_path / "a.ply"
+    with pytest.raises(
+        osp.ConfigError, match=r"^source: must be the path of a file or folder, not a Scene; wr"
+    ):
+        osp.crop(scene, target, sphere=(0, 0, 0, 1))  # type: ignore[arg-type]
+    with pytest.raises(osp.ConfigError, match=r"^matrix: must be the path of a file or folder, not a list"):
+        osp.transform(scene_file, target, matrix=np.eye(4))  # type: ignore[arg-type]
+    with pytest.raises(osp.ConfigError, match=r"^up: must be a list, not a str"):
+        osp.transform(scene_file, target, up="z")  # type: ignore[arg-type]
+    with pytest.raises(osp.ConfigError, match=r"^threads: must be 0"):
+        osp.crop(scene_file, target, sphere=(0, 0, 0, 1), threads=-1)
+    with pytest.raises(TypeError, match="save takes a scene"):
+        osp.save(scene_file, target)  # type: ignore[arg-type]

@@ -85,7 +85,9 @@ def _one(annotation: Any) -> str:
         return f"Literal[{', '.join(map(_quoted, arguments))}]"
     if origin in (tuple, list, set, frozenset):
         inner = sorted({type_text(argument) for argument in arguments if argument is not Ellipsis})
-        return f"Sequence[{' | '.join(inner)}]"
+        # One value alone may stand where any number may be given.
+        alone = " | PathLike" if Ellipsis in arguments and inner == ["PathLike"] else ""
+        return f"Sequence[{' | '.join(inner)}]{alone}"
     if origin is dict or annotation is dict:
         return "Mapping[str, Any]"
     if isinstance(annotation, type):

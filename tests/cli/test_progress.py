@@ -4,6 +4,7 @@ import io
 import json
 import re
 import time
+from dataclasses import replace
 
 import pytest
 from rich.console import Console
@@ -44,6 +45,18 @@ def test_plain_lines_show_training_state():
         "Training",
         f"  310/1500: {STATE}, 1:23 left",
         f"Trained 310 iterations in 1:23 min: {STATE}",
+    ]
+
+
+def test_held_out_views_measured_before_the_training_are_not_shown_as_its_state():
+    lines = []
+    show = EventLines(lines.append, interval_seconds=0.0)
+    for event in (PhaseStarted("train", 1500), replace(HELD_OUT, iteration=0), TRAINING, HELD_OUT, TRAINING):
+        show(event)
+    assert lines == [
+        "Training",
+        f"  310/1500: {STATE.replace('held out 23.0 dB, ', '')}, 1:23 left",
+        f"  310/1500: {STATE}, 1:23 left",
     ]
 
 

@@ -57,7 +57,17 @@ def test_truncated_photograph_is_refused_before_pose_search(noise, octasplat, tm
     (noise / "2.jpg").write_bytes(whole[: len(whole) // 2])
     refused = octasplat("reconstruct", noise, "-o", tmp_path / "out", *tiny)
     assert refused.exit_code == 1 and "2.jpg is damaged or cut short" in refused.stderr
+    assert "replace the file, or take it out of the folder." in refused.stderr
     assert "features" not in refused.stdout and not (tmp_path / "out").exists()
+
+
+def test_all_truncated_photographs_are_named_at_once(noise, octasplat, tmp_path, tiny):
+    for name in ("1.jpg", "3.jpg"):
+        whole = (noise / name).read_bytes()
+        (noise / name).write_bytes(whole[: len(whole) // 2])
+    refused = octasplat("reconstruct", noise, "-o", tmp_path / "out", *tiny)
+    assert refused.exit_code == 1
+    assert f"2 photographs of {noise} are damaged or cut short (1.jpg, 3.jpg); replace" in refused.stderr
 
 
 def test_missing_masks_are_refused_before_pose_search(noise, octasplat, tmp_path, tiny):

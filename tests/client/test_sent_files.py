@@ -15,6 +15,7 @@ from octasplat.engine.core.errors import DatasetError
 from octasplat.workers.client import backoff
 from octasplat.workers.client.api import Api, ServiceError
 from octasplat.workers.client.resumable_upload import send_resumable
+from octasplat.workers.client.submission import Derivation, Submission, derive, submit
 from octasplat.workers.client.upload import upload_files
 from tests.support.scripted_front import Answer, Front, as_json, as_page, serve
 
@@ -311,3 +312,19 @@ def test_delete_of_missing_file_succeeds(serve: Callable[..., Front], tmp_path: 
     with Api(front.address) as api:
         assert upload_files(api, {"a": tmp_path / "a"})["state"] == "committed"
     assert removals == [2] and there == {"a"}
+
+
+def test_refused_options_cost_no_upload(serve: Callable[..., Front], tmp_path: Path) -> None:
+    asked: list[str] = []
+
+    def service(_method: str, path: str, _headers: dict[str, str], _body: bytes) -> Answer:
+        asked.append(path)
+        return as_json({"detail": "There is no setting 'iteration'; the nearest is iterations."}, 422)
+
+    (tmp_path / "a.obj").write_text("x")
+    with Api(serve(service).address) as api:
+        with pytest.raises(ServiceError, match="the nearest is iterations"):
+            submit(api, Submission(tmp_path, {"iteration": 3}))
+        with pytest.raises(ServiceError, match="the nearest is iterations"):
+            derive(api, Derivation(None, "import", {"iteration": 3}, {"a.obj": tmp_path / "a.obj"}))
+    assert asked == ["/v1/estimates"] * 2

@@ -244,6 +244,28 @@ def test_ply_polygons_become_fans(tmp_path: Path) -> None:
     np.testing.assert_array_equal(mesh.vertices[:, 0], [0, 1, 1, 0])
 
 
+def test_ply_with_lists_at_its_vertices_is_read(tmp_path: Path) -> None:
+    # trimesh 5 writes colors so.
+    fields = [*((name, "<f4") for name in "xyz"), *list_field("color", "u1", 4), ("s", "<f8"), ("t", "<f8")]
+    vertices = np.zeros(3, dtype=fields)
+    vertices["x"], vertices["s"] = [0, 1, 2], [0.25, 0.5, 1]
+    vertices["color" + COUNT_SUFFIX] = 4
+    path = tmp_path / "mesh.ply"
+    write_ply(path, [PlyWriteElement("vertex", 3, vertices.dtype, [vertices])])
+    mesh = read_mesh(path)
+    np.testing.assert_array_equal(mesh.vertices[:, 0], [0, 1, 2])
+    np.testing.assert_array_equal(mesh.uv[:, 0], np.float32([0.25, 0.5, 1]))
+
+
+def test_ply_with_a_list_for_a_coordinate_is_refused_by_its_name(tmp_path: Path) -> None:
+    rows = np.zeros(1, dtype=[("x", "<f4"), ("y", "<f4"), *list_field("z", "f4", 2)])
+    rows["z" + COUNT_SUFFIX] = 2
+    path = tmp_path / "mesh.ply"
+    write_ply(path, [PlyWriteElement("vertex", 1, rows.dtype, [rows])])
+    with pytest.raises(SceneFileError, match=r"lack the property z\."):
+        read_mesh(path)
+
+
 def test_ply_of_gaussians_is_no_mesh(tmp_path: Path) -> None:
     rows = np.zeros(2, dtype=[(name, "<f4") for name in ("x", "y", "z", "f_dc_0")])
     path = tmp_path / "scene.ply"

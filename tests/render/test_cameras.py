@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.render.pinhole_camera import PinholeCamera, focal_from_fov
 
 
@@ -9,7 +10,7 @@ def camera(**changes):
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_euler("xyz", [20, -50, 130], degrees=True).as_matrix()
     pose[:3, 3] = [1, -2, 3]
-    return PinholeCamera.from_pose(pose, 8, 6, **({"fy_px": 9.0} | changes))
+    return PinholeCamera.from_pose(pose, **({"width_px": 8, "height_px": 6, "fy_px": 9.0} | changes))
 
 
 def test_ray_projects_to_pixel_centre():
@@ -42,3 +43,20 @@ def test_camera_pose_round_trip():
 def test_field_of_view_spans_image():
     assert focal_from_fov(90.0, 200) == pytest.approx(100)
     assert focal_from_fov(60.0, 200) == pytest.approx(100 * np.sqrt(3))
+
+
+def test_what_is_no_pose_is_refused():
+    one = camera()
+    near = PinholeCamera.from_pose(one.world_from_cam[:3].astype(np.float32).tolist(), 8, 6, fy_px=9.0)
+    assert np.allclose(near.centre_world, one.centre_world, atol=1e-6)
+    mirrored, infinite = np.diag([1.0, 1, -1, 1]), np.eye(4)
+    infinite[0, 3] = np.inf
+    for pose in (np.eye(3), "here", 2 * np.eye(4), mirrored, infinite):
+        with pytest.raises(ConfigError, match=r"^world_from_cam: must "):
+            PinholeCamera.from_pose(pose, 8, 6, fy_px=9.0)
+    with pytest.raises(ConfigError, match="at least 1"):
+        camera(width_px=0)
+    with pytest.raises(ConfigError, match="focal length"):
+        camera(fy_px=-9.0)
+    with pytest.raises(ConfigError, match="three finite numbers"):
+        PinholeCamera.looking_at((0, 0), (0, 0, 1))

@@ -258,3 +258,48 @@ async def test_readers_estimate_but_hear_nothing_of_hosts_and_others(connect_ser
             assert (await http.get("/metrics", headers=headers)).status_code == status
         for path in ("/v1/jobs", "/v1/info", "/v1/queues", "/v1/tokens"):
             assert (await http.get(path, headers=monitor)).status_code == 403
+
+
+async def test_bodies_that_cannot_be_read_are_refused_in_words_of_http(
+    connect_service: ConnectService,
+) -> None:
+    async with connect_service() as (http, _service):
+        # curl -d without a header
+        form = await http.post(
+            "/v1/jobs",
+            content=b'{"kind": "info"}',
+            headers={"Content-Type": "application/x-www-form-urlencoded"},
+        )
+        (fault,) = form.json()["errors"]
+        assert form.status_code == 422 and fault["pointer"] == "#"
+        assert (
+            fault["detail"] == "The body is read as JSON only with the header Content-Type: application/json"
+        )
+        broken = await http.post(
+            "/v1/jobs", content=b'{"dataset_id": ', headers={"Content-Type": "application/json"}
+        )
+        (fault,) = broken.json()["errors"]
+        assert fault["pointer"] == "#"
+        assert fault["detail"] == "The body is no JSON: Expecting value at character 15"
+        unknown = await http.post("/v1/jobs", json={"dataset": str(uuid.uuid4())})
+        (fault,) = unknown.json()["errors"]
+        assert fault == {
+            "code": "extra_forbidden", "detail": "There is no field 'dataset' here", "pointer": "#/dataset",
+        }  # fmt: skip
+        option = await http.post("/v1/estimates", json={"kind": "render", "options": {"frame": 60}})
+        (fault,) = option.json()["errors"]
+        assert fault["detail"] == "There is no such option; the nearest is frames"
+        assert fault["pointer"] == "#/options/frame"
+
+
+async def test_refused_method_is_answered_with_all_that_the_address_takes(
+    connect_service: ConnectService,
+) -> None:
+    async with connect_service() as (http, _service):
+        for address, methods in (
+            ("/v1/jobs", "GET, POST"),
+            (f"/v1/jobs/{uuid.uuid4()}", "DELETE, GET, PATCH"),
+            ("/v1/info", "GET"),
+        ):
+            refused = await http.put(address)
+            assert (refused.status_code, refused.headers["Allow"]) == (405, methods), address

@@ -5,6 +5,7 @@ import base64
 import logging
 import socket
 import uuid
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from standardwebhooks.webhooks import Webhook, WebhookVerificationError
 from octasplat.workers.db.connections import open_pool
 from octasplat.workers.maintenance.webhooks.outbox import RETRY_DELAYS_SECONDS, lease_due, purge_deliveries
 from octasplat.workers.maintenance.webhooks.sender import MAX_PER_OWNER, WebhookSender
+from octasplat.workers.maintenance.webhooks.signing import signed_message
 from tests.support.service_harness import (
     ConnectService,
     claim_job,
@@ -306,3 +308,15 @@ async def test_messages_of_paused_webhook_expire(connect_service: ConnectService
             paused, active = [(await deliveries(http, hook))[0] for hook in hooks]
             assert paused["state"] == "failed" and "paused" in paused["error"]
             assert active["state"] == "pending"
+
+
+def test_documented_check_knows_genuine_messages() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "service.md").read_text(encoding="utf-8")
+    (program,) = (block for block in page.split("```python\n") if "def is_genuine" in block)
+    found: dict[str, Any] = {}
+    exec(program.split("```")[0], found)
+    is_genuine = found["is_genuine"]
+    body, headers = signed_message(SECRET, uuid.uuid4(), {"type": "job.succeeded"}, datetime.now(UTC))
+    assert is_genuine(SECRET, headers, body)
+    assert not is_genuine(SECRET, headers, body + b" ")
+    assert not is_genuine(SECRET, headers | {"webhook-timestamp": "1700000000"}, body)

@@ -3,6 +3,7 @@
 import uuid
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from http import HTTPStatus
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -19,7 +20,7 @@ from octasplat.engine.pathtracing.stage.stage_file import (
 )
 from octasplat.engine.render.path_document import read_path_document
 from octasplat.engine.settings.nested_options import merge_options
-from octasplat.workers.client.api import Api
+from octasplat.workers.client.api import Api, ServiceError
 from octasplat.workers.client.bucket import import_bucket, is_bucket_address
 from octasplat.workers.client.dataset_tasks import import_scene, is_web_address
 from octasplat.workers.client.download import download_archive, download_results
@@ -78,9 +79,24 @@ def submit(api: Api, submission: Submission, on_event: EventListener = ignore_ev
     if submission.start_from is not None:
         body["source_id"] = submission.start_from
     if submission.scene is not None:
+        _check_options(api, "reconstruct", submission.options, submission.queue)
         body["dataset_id"] = _upload_if_needed(api, submission.scene, on_event, submission.sha256)
     job: dict[str, Any] = api.post("/v1/jobs", body)
     return job
+
+
+def _check_options(api: Api, kind: str, options: Mapping[str, Any], queue: str) -> None:
+    """Let options be refused before anything is sent, which may take hours; others show when the job is made.
+
+    Raises:
+        ServiceError: the service refuses them.
+        ServiceUnreachableError: it does not answer.
+    """
+    try:
+        api.post("/v1/estimates", {"kind": kind, "options": dict(options), "queue": queue})
+    except ServiceError as error:
+        if error.status == HTTPStatus.UNPROCESSABLE_ENTITY:
+            raise
 
 
 @dataclass(frozen=True)
@@ -198,6 +214,8 @@ def derive(api: Api, derivation: Derivation, on_event: EventListener = ignore_ev
     }
     if derivation.source_id is not None:
         body["source_id"] = derivation.source_id
+    if derivation.scene is not None or derivation.files:
+        _check_options(api, derivation.kind, derivation.options, derivation.queue)
     if derivation.scene is not None:
         body["dataset_id"] = _upload_if_needed(api, derivation.scene, on_event)
     if derivation.files:

@@ -36,7 +36,7 @@ def list_scene_files(
         ServiceError: the service cannot be asked.
     """
     if not scene.is_dir():
-        raise DatasetError(f"{scene} is not a folder; name the folder that holds images/ and sparse/.")
+        raise DatasetError(f"{scene} is not a folder; name the folder that holds the photographs.")
     unreadable: list[Path] = []
     found = sorted(files_below(scene, on_unreadable=unreadable.append))
     if (sentence := unreadable_folders_sentence(unreadable, scene)) is not None:

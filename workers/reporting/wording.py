@@ -14,7 +14,8 @@ def format_rate(per_second: float) -> str:
 def format_training_state(event: TrainingProgress, held_out: HeldOutMeasured | None) -> str:
     """Return the state of the training, without its iterations and the time left."""
     parts = [f"training {event.psnr:.1f} dB"]
-    if held_out is not None:
+    # What was measured before the training says nothing of it, and short ones measure once more at their end.
+    if held_out is not None and (held_out.iteration > 0 or event.iteration == 0):
         parts.append(f"held out {held_out.psnr:.1f} dB")
     parts += [f"{event.gaussians:,} Gaussians", f"{format_rate(event.rays_per_second)} rays/s"]
     return ", ".join(parts)
