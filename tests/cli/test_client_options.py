@@ -72,12 +72,13 @@ def test_submit_names_the_job_that_it_begins_with(octasplat, asked: list[dict]) 
     dataset = "01999999-0000-7000-8000-000000000815"
     done = octasplat("submit", dataset, "--start-from", JOB["id"])
     assert done.exit_code == 0, done.output
-    first, second = asked
+    first, checked, second = asked  # options are checked before photographs would be sent
+    assert checked == {"kind": "reconstruct", "options": {}, "queue": "cpu"}
     assert first["source_id"] == second["source_id"] == JOB["id"]
     assert first["options"] == {"preset": "high"} and "dataset_id" not in first
     assert second["dataset_id"] == dataset
     refused = octasplat("submit", "--preset", "high")
-    assert refused.exit_code == 2 and "--start-from" in refused.stderr and len(asked) == 2
+    assert refused.exit_code == 2 and "--start-from" in refused.stderr and len(asked) == 3
 
 
 @pytest.mark.parametrize("command", [("submit", "photos"), ("derive", "render", JOB["id"])])

@@ -106,7 +106,7 @@ def test_run_goes_on_where_memory_is_reckoned_otherwise_than_when_it_was_begun(
     for name, kept in (("same", most), ("other", most + 1000)):
         task = Task(tmp_path / name, complete.model_dump(mode="json"), scene=scene)
         (task.run / "blocks").mkdir(parents=True)
-        write_config(scene, task.run, complete.run_config())
+        write_config(scene, task.run, complete.run_config(), given=None)
         keep_request(task.run, BlockRequest(most_gaussians=kept), is_new=True)
         if reached == "plan":
             nothing = Rectangles(np.zeros(0, np.int64), *np.zeros((2, 0, 2), np.int64))

@@ -128,10 +128,10 @@ def test_poses_that_are_exchanged_while_they_are_stored_are_those_of_one_folder(
     write_poses(new, "second")
     opened, open_writer = itertools.count(), storage.open_writer
 
-    def exchange_then_open() -> Any:
+    def exchange_then_open(*, max_bytes: int | None) -> Any:
         if next(opened) == stored_before:
             replace_folder(poses, new)
-        return open_writer()
+        return open_writer(max_bytes=max_bytes)
 
     monkeypatch.setattr(storage, "open_writer", exchange_then_open)
     stored = workspace.store_checkpoint("poses", 9)
