@@ -57,7 +57,7 @@ def apply_choice(
     """
     before = config.model_dump(mode="json")
     if choice != "none":
-        return revise_config(before, train={"materials": {"recipe": choice}})
+        return revise_config(before, train={"materials": {"recipe": choice}}, given=given)
     # edges are a term of materials alone, which would be refused
     return revise_config(before, materials=False, train={"loss": {"edges": None}}, given=given)
 

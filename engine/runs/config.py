@@ -6,7 +6,7 @@ Imports neither torch nor numba.
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
@@ -19,6 +19,7 @@ from octasplat.engine.settings.nested_options import merge_options
 from octasplat.engine.settings.preset_names import PRESETS, PRESETS_WITH_MATERIALS
 from octasplat.engine.settings.refusals import InvalidSettingsError, Refusal, refusals_from
 from octasplat.engine.settings.renamed_settings import replace_former_names
+from octasplat.engine.shading.material_settings import Recipe
 from octasplat.engine.train.config import TrainConfig, preset, with_materials
 
 GIVEN = "given"
@@ -114,7 +115,7 @@ def resolve_config(
         {**given, "preset": preset_name}, materials or None, train, assignments
     )
     # the preset depends on the changes: any of them may switch materials on
-    base = _preset_settings(values["preset"], _learns_materials(changes))
+    base = _preset_settings(values["preset"], _learnt_recipe(changes))
     return _validate_config({**values, "train": merge_options(base, changes)})
 
 
@@ -188,8 +189,8 @@ def revise_config(
 ) -> ReconstructionConfig:
     """Return a configuration with changes; another preset brings its own settings of the training.
 
-    Where the changes switch materials on or off, the rest of what that means comes with it, but for the
-    settings that were given.
+    Where the changes switch materials on or off, or their recipe, the rest of what that means comes with it,
+    but for the settings that were given.
 
     Args:
         before: the configuration, as JSON.
@@ -207,21 +208,20 @@ def revise_config(
     values, changes = _collect_changes(settings or {}, materials, train, assignments)
     values = {**before, **values}
     former: Mapping[str, Any] = before.get("train", {})
-    learnt = _learns_materials(former)
+    recipe, wanted = _learnt_recipe(former), _learnt_recipe(merge_options(former, changes))
     if values.get("preset") != before.get("preset"):
-        former = {}  # of another preset: none of its settings stay
-    elif _learns_materials(merge_options(former, changes)) == learnt:
+        former, wanted = {}, _learnt_recipe(changes)  # of another preset: none of its settings stay
+    elif wanted == recipe:
         return _validate_config({**values, "train": merge_options(former, changes)})
     else:
-        # materials were switched: what was given stays, the new preset gives the rest
+        # materials or their recipe were switched: what was given stays, the preset gives the rest
         former = (
-            _changed_values(_preset_settings(before.get("preset"), learnt), former)
+            _changed_values(_preset_settings(before.get("preset"), recipe), former)
             if given is None
             else named_values(former, given)
         )
-    requested = merge_options(former, changes)
-    base = _preset_settings(values.get("preset"), _learns_materials(requested))
-    return _validate_config({**values, "train": merge_options(base, requested)})
+    base = _preset_settings(values.get("preset"), wanted)
+    return _validate_config({**values, "train": merge_options(base, merge_options(former, changes))})
 
 
 def read_given(path: Path) -> tuple[str, ...] | None:
@@ -306,11 +306,11 @@ def _read_assignment(assignment: str) -> tuple[list[str], Any]:
     return path[1:] if path[0] == "train" and len(path) > 1 else path, value  # train. may be left out
 
 
-def _preset_settings(preset_name: object, materials: bool) -> dict[str, Any]:
+def _preset_settings(preset_name: object, recipe: Recipe | None) -> dict[str, Any]:
     """Return a preset's training settings as JSON; empty for an unknown preset, which validation refuses."""
     if preset_name not in PRESETS:
         return {}
-    if materials and preset_name not in PRESETS_WITH_MATERIALS:
+    if recipe is not None and preset_name not in PRESETS_WITH_MATERIALS:
         *others, last = PRESETS_WITH_MATERIALS
         sentence = (
             f"The preset {preset_name} is for scenes without materials; with materials choose "
@@ -318,16 +318,19 @@ def _preset_settings(preset_name: object, materials: bool) -> dict[str, Any]:
         )
         raise InvalidSettingsError([Refusal(("preset",), "materials", sentence)])
     chosen = preset(str(preset_name))
-    return (with_materials(chosen) if materials else chosen).model_dump(mode="json")
+    return (with_materials(chosen, recipe) if recipe is not None else chosen).model_dump(mode="json")
 
 
-def _learns_materials(train: Mapping[str, Any]) -> bool:
-    """Return whether training settings switch materials on, in any accepted spelling."""
+def _learnt_recipe(train: Mapping[str, Any]) -> Recipe | None:
+    """Return the recipe of training settings that switch materials on, in any accepted spelling, or None."""
     materials = train.get("materials")
     try:
-        return isinstance(materials, Mapping) and _BOOL.validate_python(materials.get("learn", False))
+        if not isinstance(materials, Mapping) or not _BOOL.validate_python(materials.get("learn", False)):
+            return None
     except ValidationError:
-        return False  # refused later, with a sentence that names it
+        return None  # refused later, with a sentence that names it
+    recipe = materials.get("recipe")
+    return recipe if recipe in get_args(Recipe) else "split_sum"  # what there is not is refused later, too
 
 
 _BOOL = TypeAdapter(bool)

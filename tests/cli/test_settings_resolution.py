@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.operations.base import build_request
 from octasplat.engine.operations.reconstruct import ReconstructOptions, ReconstructRequest, run_config
-from octasplat.engine.runs.config import ReconstructionConfig, RunSettings
+from octasplat.engine.runs.config import ReconstructionConfig, RunSettings, resolve_config, revise_config
 from octasplat.engine.runs.settings_catalog import all_settings as catalog
 from octasplat.engine.settings.nested_options import merge_options
 from octasplat.engine.settings.preset_names import PRESETS
@@ -199,14 +199,28 @@ def _nested(preset: str, materials: bool, given: list[str]) -> dict[str, Any]:
 def test_materials_settings_resolve_equally_in_all_spellings(options: dict[str, Any]) -> None:
     config = by_python({"preset": "fast", **options})
     assert isinstance(config, ReconstructionConfig)
+    assert config.train.materials.learn and config.train.rays_per_batch == 8192
+    assert (config.train.sh_degree, config.train.shared_sort_until) == (3, 0.0)
+    assert (config.train.lr.quat, config.train.iterations) == (3e-3, 1400)
+
+
+@pytest.mark.parametrize("recipe", ["near_field", "ref_gaussian"])
+def test_short_training_by_other_recipe_has_steps_of_its_own(recipe: str) -> None:
+    """However the recipe is told, and whether at once or of a configuration that is there."""
+    at_once = by_python({"preset": "fast", "materials": True, "assignments": [f"materials.recipe={recipe}"]})
+    assert isinstance(at_once, ReconstructionConfig)
+    assert (at_once.train.sh_degree, at_once.train.lr.quat, at_once.train.loss.edges) == (1, 1e-3, None)
     assert (
-        config.train.materials.learn and config.train.rays_per_batch == 8192 and config.train.sh_degree == 1
+        by_python(
+            {"preset": "fast", "train": {"materials": {"learn": True, "recipe": recipe}}},
+        )
+        == at_once
     )
-    assert (config.train.shared_sort_until, config.train.lr.quat, config.train.iterations) == (
-        0.0,
-        1e-3,
-        1400,
-    )
+    before = resolve_config("fast", materials=True).model_dump(mode="json")
+    assert revise_config(before, train={"materials": {"recipe": recipe}}) == at_once
+    given = resolve_config("fast", materials=True, assignments=["sh_degree=3"]).model_dump(mode="json")
+    revised = revise_config(given, train={"materials": {"recipe": recipe}}, given=["sh_degree"])
+    assert (revised.train.sh_degree, revised.train.lr.quat) == (3, 1e-3)
 
 
 def test_paper_preset_with_materials_is_refused() -> None:

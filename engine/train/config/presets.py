@@ -3,6 +3,7 @@
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.gaussians.octagon import CHI2_3_99
 from octasplat.engine.settings.preset_names import PRESETS
+from octasplat.engine.shading.material_settings import Recipe
 from octasplat.engine.trace.protocol import TraceSettings
 from octasplat.engine.train.config.densify import McmcConfig, RedisplatsConfig
 from octasplat.engine.train.config.learning_rates import LearningRates
@@ -16,16 +17,27 @@ SHORT_TRAINING = 5000
 SHORT_EDGE_WEIGHT = 1.0
 """``loss.edges`` of such a training with materials."""
 SHORT_MATERIAL_RATES = {"mean": 0.05, "log_scale": 0.04, "albedo": 0.08, "metallic": 0.05, "roughness": 0.05}
+"""Learning rates of such a training."""
+SHORT_NORMAL_WEIGHT = 0.05
+"""Its ``materials.normal_weight`` and ``depth_normal_weight``, where rays for edges move the Gaussians."""
 
 
-def with_materials(config: TrainConfig) -> TrainConfig:
+def with_materials(config: TrainConfig, recipe: Recipe = "split_sum") -> TrainConfig:
     """Return a configuration for reflective scenes: materials are learnt, and geometry moves in small steps.
 
     Reflections ask for normals to within a degree, so steps are small. Points lifted from photographs that
     show reflections lie behind the surface, so there are none. In a short training small steps do not get to
-    where thin parts and textures are: all but those of the rotations are larger there.
+    where thin parts and textures are: all but those of the rotations are larger there. Rays for edges
+    (``loss.edges``), which ``split_sum`` alone has there, want harmonics that show colors by direction, and
+    allow more: larger rotations, weaker terms for smooth normals, twice as many Gaussians, and growth where
+    the photographs differ.
+
+    Args:
+        config: of a preset.
+        recipe: of the materials; the configuration does not name it.
     """
     is_short = 0 < config.iterations <= SHORT_TRAINING
+    has_edge_rays = is_short and recipe == "split_sum"
     rates = {
         "quat": 1e-3,
         "mean": 0.016,
@@ -35,29 +47,37 @@ def with_materials(config: TrainConfig) -> TrainConfig:
         "sh_rest_ratio": 0.05,
         "scale_after": 0,
         **(SHORT_MATERIAL_RATES if is_short else {}),
+        **({"quat": 3e-3} if has_edge_rays else {}),
     }
+    materials: dict[str, object] = {
+        "learn": True,
+        # Rays may begin so near to a surface as they pass it, which normals with a side allow.
+        "ray_bias": 1e-3,
+        "backface_cull_distance": 1e-2,
+        "depth_split": 8.0,
+    }
+    if has_edge_rays:
+        materials.update(normal_weight=SHORT_NORMAL_WEIGHT, depth_normal_weight=SHORT_NORMAL_WEIGHT)
     densify = McmcConfig(copies="area", stop_fraction=0.4, relocate_low_weight_below=0.0)
     if is_short:
-        densify = densify.model_copy(update={"growth": 0.4, "stop_fraction": 0.5})
+        growth = {"growth": 0.4, "stop_fraction": 0.5, "error_power": 1.0 if has_edge_rays else 0.0}
+        densify = densify.model_copy(update=growth)
     return config.model_copy(
         update={
-            # Rays may begin so near to a surface as they pass it, which normals with a side allow.
-            "materials": config.materials.model_copy(
-                update={"learn": True, "ray_bias": 1e-3, "backface_cull_distance": 1e-2, "depth_split": 8.0}
-            ),
+            "materials": config.materials.model_copy(update=materials),
             "lr": config.lr.model_copy(update=rates),
             # Gaps under things that stand on a mirror would be filled with what looks like the reflection.
             "loss": config.loss.model_copy(
-                update={"free_space": 0.05, "edges": SHORT_EDGE_WEIGHT if is_short else None}
+                update={"free_space": 0.05, "edges": SHORT_EDGE_WEIGHT if has_edge_rays else None}
             ),
             "plane_sweep_init": False,
             "normal_neighbors": 10,
-            "sh_degree": min(config.sh_degree, 1),
-            "sh_degree_interval": 400,
+            "sh_degree": min(config.sh_degree, 3 if has_edge_rays else 1),
+            "sh_degree_interval": 100 if has_edge_rays else 400,
             "rays_per_batch": 8192,
             "iterations": config.iterations * 14 // 25,  # which take longer by ray, and longer with light
             "rays_per_pixel": 8,
-            "pixels_per_gaussian": 50,
+            "pixels_per_gaussian": 25 if has_edge_rays else 50,
             "best_checkpoint_margin_db": 0.3,
             "weight_averaging_start": 0.8,
             "min_blend_weight": 0.0,

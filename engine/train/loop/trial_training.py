@@ -116,7 +116,8 @@ def material_gain_db(
     color = evaluation_background(background)
     probe = draw_probe(dataset, indices, MATERIAL_PROBE_RAYS, color, np.random.default_rng(seed))
     found = []
-    lit = with_materials(preset("fast"))
+    # For all recipes those settings by which it was measured what a trial says.
+    lit = with_materials(preset("fast"), "near_field")
     lit = lit.model_copy(
         update={
             "materials": lit.materials.model_copy(update={"recipe": recipe}),
