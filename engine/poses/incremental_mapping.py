@@ -5,6 +5,7 @@ now and then other photographs; most of the mapper runs on one thread anyway.
 """
 
 from collections.abc import Callable, Collection, Sequence, Set
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,28 @@ _WEAK_INITIAL_INLIERS = 50
 _MIN_SEEN_POINTS = 30
 """Points that a photograph placed so has to see in a large capture, whose places may look alike: in a street
 ten false ones saw 20 and less, and right ones 60 and more."""
+
+
+@dataclass(frozen=True)
+class Continuation:
+    """From where mapping goes on, and what it maps.
+
+    Attributes:
+        start: folder of a model to go on from.
+        allow_weak_links: place photographs by fewer matches, too.
+        apart: complete models, whose photographs are not mapped again.
+        left_out: indices of further photographs that are not mapped.
+        extends_only: map no models beside ``start``.
+    """
+
+    start: Path | None = None
+    allow_weak_links: bool = False
+    apart: Sequence[Any] = ()
+    left_out: Collection[int] = ()
+    extends_only: bool = False
+
+
+FROM_THE_BEGINNING = Continuation()
 
 
 class _SegmentEndError(Exception):
@@ -80,11 +103,7 @@ def map_in_segments(
     *,
     seed: int,
     on_count: OnCount,
-    allow_weak_links: bool = False,
-    start: Path | None = None,
-    apart: Sequence[Any] = (),
-    left_out: Collection[int] = (),
-    extends_only: bool = False,
+    continuation: Continuation = FROM_THE_BEGINNING,
 ) -> list[Any]:
     """Reconstruct a large capture as :func:`map_photographs` does, with less effort for each photograph.
 
@@ -97,17 +116,13 @@ def map_in_segments(
         stored: state of this mapping, from which it goes on.
         seed: of everything random.
         on_count: hears of the photographs in all models so far.
-        allow_weak_links: place photographs by fewer matches, too.
-        start: folder of a model to go on from.
-        apart: complete models, whose photographs are not mapped again.
-        left_out: indices of further photographs that are not mapped.
-        extends_only: map no models beside ``start``.
+        continuation: from where it goes on, and with which photographs.
 
     Returns:
         Each a ``pycolmap.Reconstruction``, without those apart; none where nothing fits together.
     """
-    options = _options(seed, allow_weak_links)
-    options.multiple_models = not extends_only
+    options = _options(seed, continuation.allow_weak_links)
+    options.multiple_models = not continuation.extends_only
     options.ba_global_frames_ratio = options.ba_global_points_ratio = _LARGE_GROWTH
     options.ba_global_max_refinements = _LARGE_REFINEMENTS
     options.ba_global_max_num_iterations = _LARGE_ADJUSTMENT_STEPS
@@ -115,27 +130,21 @@ def map_in_segments(
     options.ba_local_function_tolerance = _COMPLETE_TOLERANCE
     count = _Count(on_count)
     while not stored.state.is_done:
-        _map_segment(options, database, stored, start, apart, left_out, count)
+        _map_segment(options, database, stored, continuation, count)
     models = stored.models()
-    count.tell(len(photograph_indices([*apart, *models])))
+    count.tell(len(photograph_indices([*continuation.apart, *models])))
     return sorted(models, key=model_rank, reverse=True)
 
 
 def _map_segment(
-    options: Any,
-    database: Path,
-    stored: StoredMapping,
-    start: Path | None,
-    apart: Sequence[Any],
-    left_out: Collection[int],
-    count: "_Count",
+    options: Any, database: Path, stored: StoredMapping, continuation: Continuation, count: "_Count"
 ) -> None:
     """Map until a segment ends or there is no more to map, and write the state."""
     manager = pycolmap.ReconstructionManager()
-    if (begun := stored.state.current or start) is not None:
+    if (begun := stored.state.current or continuation.start) is not None:
         manager.read(begun)
-    finished = [*apart, *stored.models()]
-    options.image_names = _names_left(database, finished, _all_models(manager), left_out)
+    finished = [*continuation.apart, *stored.models()]
+    options.image_names = _names_left(database, finished, _all_models(manager), continuation.left_out)
     is_segment_end = _run_mapper(
         options, database, manager, count, ends_segments=True, finished=photograph_indices(finished)
     )

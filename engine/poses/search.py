@@ -1,9 +1,8 @@
 """The search for poses, from photographs to a model that can be trusted; runs in a process of its own."""
 
 import sqlite3
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +38,8 @@ from octasplat.engine.poses.features import (
 from octasplat.engine.poses.found_models import write_other_models
 from octasplat.engine.poses.gps_contradictions import read_ground_positions
 from octasplat.engine.poses.incremental_mapping import (
+    FROM_THE_BEGINNING,
+    Continuation,
     best_rank,
     map_in_segments,
     map_photographs,
@@ -50,7 +51,7 @@ from octasplat.engine.poses.photograph_check import (
     read_image_infos,
     warn_of_small_photographs,
 )
-from octasplat.engine.poses.remaining_photographs import register_remaining
+from octasplat.engine.poses.remaining_photographs import MatchedCapture, register_remaining
 from octasplat.engine.poses.search_check import check_mapped, search_rank
 from octasplat.engine.poses.stored_mappings import (
     MAPPINGS_FOLDER,
@@ -171,14 +172,16 @@ class PoseSearch:
             )
             if best_rank(mapped.models)[0] < count:
                 mapped = register_remaining(
-                    database,
-                    self._aliases,
+                    MatchedCapture(
+                        database,
+                        self._aliases,
+                        matched,
+                        ground_m,
+                        self._config,
+                        lambda copy, continuation: self._map(copy, at, continuation),
+                        self._threads,
+                    ),
                     mapped,
-                    matched,
-                    ground_m,
-                    self._config,
-                    partial(self._map, at=at),
-                    threads=self._threads,
                 )
             at(mapped.placed(count))
         return mapped
@@ -259,17 +262,16 @@ class PoseSearch:
         self,
         database: Path,
         at: Callable[[int], None],
-        *,
-        allow_weak_links: bool = False,
-        start: Path | None = None,
-        apart: Sequence[Any] = (),
-        left_out: Collection[int] = (),
-        extends_only: bool = False,
+        continuation: Continuation = FROM_THE_BEGINNING,
     ) -> list[Any]:
         seed = self._config.seed
         if not self._config.is_large(len(self._names)):
             return map_photographs(
-                database, seed=seed, on_count=at, allow_weak_links=allow_weak_links, start=start
+                database,
+                seed=seed,
+                on_count=at,
+                allow_weak_links=continuation.allow_weak_links,
+                start=continuation.start,
             )
         # A search that goes on maps the same matches in the same order.
         folder = self._work / MAPPINGS_FOLDER / str(self._mappings)
@@ -279,11 +281,7 @@ class PoseSearch:
             StoredMapping(folder, matches_digest(database), self._tell_stored_mapping),
             seed=seed,
             on_count=at,
-            allow_weak_links=allow_weak_links,
-            start=start,
-            apart=apart,
-            left_out=left_out,
-            extends_only=extends_only,
+            continuation=continuation,
         )
 
     def _tell_stored_mapping(self, placed: int) -> None:

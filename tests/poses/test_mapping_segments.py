@@ -13,7 +13,12 @@ from octasplat.engine.poses import incremental_mapping, linking_pairs
 from octasplat.engine.poses.ambiguous_structure import remove_pairs
 from octasplat.engine.poses.config import PosesConfig
 from octasplat.engine.poses.features import photographs_of
-from octasplat.engine.poses.incremental_mapping import map_in_segments, map_photographs, take_out_unsure
+from octasplat.engine.poses.incremental_mapping import (
+    Continuation,
+    map_in_segments,
+    map_photographs,
+    take_out_unsure,
+)
 from octasplat.engine.poses.linking_pairs import match_links
 from octasplat.engine.poses.stored_mappings import (
     MAPPINGS_FOLDER,
@@ -62,10 +67,9 @@ def ignore_count(_count: int) -> None:
     """Count nothing."""
 
 
-def mapped(database: Path, folder: Path, **options: Any) -> list[Any]:
-    return map_in_segments(
-        database, StoredMapping(folder, MATCHES, ignore_count), seed=0, on_count=ignore_count, **options
-    )
+def mapped(database: Path, folder: Path, **how: Any) -> list[Any]:
+    stored = StoredMapping(folder, MATCHES, ignore_count)
+    return map_in_segments(database, stored, seed=0, on_count=ignore_count, continuation=Continuation(**how))
 
 
 def model_files(models: list[Any], folder: Path) -> list[dict[str, bytes]]:
@@ -231,7 +235,7 @@ def test_model_takes_in_another_one_that_new_matches_link(two_places: Path, tmp_
     counted: list[int] = []
     (extended,) = map_in_segments(
         two_places, StoredMapping(tmp_path / "again", MATCHES, ignore_count), seed=0, on_count=counted.append,
-        start=start, extends_only=True,
+        continuation=Continuation(start, extends_only=True),
     )  # fmt: skip
     assert set(extended.reg_image_ids()) == set(range(1, PHOTOGRAPHS + 1))
     assert counted == list(range(half + 1, PHOTOGRAPHS + 1))
@@ -245,7 +249,7 @@ def test_photographs_that_models_share_are_counted_once(two_places: Path, tmp_pa
     counted: list[int] = []
     (_, other) = map_in_segments(
         two_places, StoredMapping(tmp_path / "again", MATCHES, ignore_count), seed=0, on_count=counted.append,
-        start=start, apart=models[:1],
+        continuation=Continuation(start, apart=models[:1]),
     )  # fmt: skip
     assert other.num_reg_images() == PHOTOGRAPHS // 2
     assert counted == COUNTED[PHOTOGRAPHS - 2 :]

@@ -16,8 +16,8 @@ from octasplat.engine.poses.ambiguous_structure import remove_pairs
 from octasplat.engine.poses.config import PosesConfig
 from octasplat.engine.poses.disambiguation import MappedModels
 from octasplat.engine.poses.features import photographs_of
-from octasplat.engine.poses.incremental_mapping import map_in_segments
-from octasplat.engine.poses.remaining_photographs import register_remaining
+from octasplat.engine.poses.incremental_mapping import FROM_THE_BEGINNING, Continuation, map_in_segments
+from octasplat.engine.poses.remaining_photographs import MatchedCapture, register_remaining
 from octasplat.engine.poses.stored_mappings import StoredMapping, matches_digest
 
 COUNT = 20
@@ -71,10 +71,10 @@ def register(
     ) -> None:
         asked["matched"], asked["with"] = list(rest), sorted(posed)
 
-    def go_on(_database: Path, *, extends_only: bool = False, **named: Any) -> list[Any]:
-        if extends_only:
+    def go_on(_database: Path, continuation: Continuation) -> list[Any]:
+        if continuation.extends_only:
             return [extended]
-        apart.append(tuple(named["apart"]))
+        apart.append(tuple(continuation.apart))
         return [LARGEST if extended is None else extended]
 
     monkeypatch.setattr(module, "propose_links", propose)
@@ -83,7 +83,8 @@ def register(
     monkeypatch.setattr(module, "write_model", lambda *_given: None)
     monkeypatch.setattr(module, "_clearest_models", lambda *_given: {})
     before = MappedModels([LARGEST, OTHER, SHARED, DOUBTFUL])
-    after = register_remaining(Path("mapping.db"), ("",) * COUNT, before, [], {}, LARGE, go_on, threads=1)
+    capture = MatchedCapture(Path("mapping.db"), ("",) * COUNT, [], {}, LARGE, go_on, threads=1)
+    after = register_remaining(capture, before)
     return after.models, asked, apart
 
 
@@ -141,14 +142,14 @@ def found_photographs(database: Path) -> list[list[int]]:
     names = photographs_of(database)
     mappings: list[Path] = []
 
-    def go_on(copy: Path, **how: Any) -> list[Any]:
+    def go_on(copy: Path, continuation: Continuation) -> list[Any]:
         mappings.append(database.with_name(f"mapping_{len(mappings)}"))
         stored = StoredMapping(mappings[-1], matches_digest(copy), lambda _count: None)
-        return map_in_segments(copy, stored, seed=0, on_count=lambda _count: None, **how)
+        return map_in_segments(copy, stored, seed=0, on_count=lambda _count: None, continuation=continuation)
 
-    mapped = MappedModels(go_on(database))
+    mapped = MappedModels(go_on(database, FROM_THE_BEGINNING))
     assert [model.num_reg_images() for model in mapped.models] == [FIRST - 2, SECOND - 2]
-    after = register_remaining(database, names, mapped, [], {}, LARGE, go_on, threads=1)
+    after = register_remaining(MatchedCapture(database, names, [], {}, LARGE, go_on, threads=1), mapped)
     return [sorted(number - 1 for number in model.reg_image_ids()) for model in after.models]
 
 
