@@ -24,11 +24,11 @@ CHOICE_KEY = "material_choice"
 LONG_TRAINING_TRIALS = 8
 """Trainings of less than so many times the rays of a trial are begun without one."""
 MAX_MATERIAL_LOSS_DB = 1.0
-"""Loss of a trial above which ``near_field`` is tried, and chosen if it loses nothing, for a thing that masks
-or alpha cut out. What is polished may gain in the end what it loses in a trial."""
+"""Loss of a trial above which a warning is given for a thing that masks or alpha cut out. Its materials are
+learnt all the same: what is polished may gain in the end what it loses in a trial."""
 MAX_WHOLE_LOSS_DB = 0.3
-"""The same for whole photographs, whose surroundings are not far away. They are trained without materials if
-``near_field`` loses, too."""
+"""Loss of a trial above which ``near_field`` is tried for whole photographs, whose surroundings are not far
+away, and chosen if it loses nothing. They are trained without materials if it loses, too."""
 
 
 def apply_choice(
@@ -121,43 +121,19 @@ def choose_materials(run: ReconstructionRun) -> None:
     run.progress(Noted("Two short trainings show first whether materials explain these photographs."))
     gain_db = _trial_gain_db(run, config.materials.recipe)
     is_chosen = _asks_for_choice(run.config) and not has_start(run.output)
-    # What was given may be possible with materials only.
-    is_whole = not (run.dataset.has_alpha or run.dataset.has_masks) and (
-        not is_chosen or _without_materials(run.config, run.given) is not None
-    )
+    is_whole = not (run.dataset.has_alpha or run.dataset.has_masks)
     if gain_db >= -(MAX_WHOLE_LOSS_DB if is_whole and is_chosen else MAX_MATERIAL_LOSS_DB):
         if is_chosen:
             _record(run, "split_sum")
         return
     loss = f"In a short training new views are {-gain_db:.1f} dB worse with materials than without"
+    if is_chosen and is_whole and _choose_for_whole_photographs(run, loss):
+        return
     if is_chosen:
-        run.progress(Noted(f"{loss}. Another one shows whether mirrors of what stands near explain them."))
-        near_gain_db = _trial_gain_db(run, "near_field")
-        if near_gain_db >= 0:
-            run.progress(
-                Warned(
-                    f"{loss}, but {near_gain_db:.1f} dB better with materials.recipe=near_field, by which "
-                    "mirrors show what stands near. That recipe is used; --set materials.fallback=false "
-                    "keeps the other."
-                )
-            )
-            _record(run, "near_field")
-            return
-        if is_whole:
-            but = "" if run.given is not None else " that differs from those with materials"
-            run.progress(
-                Warned(
-                    f"{loss}: little here reflects its surroundings clearly. The scene is trained without "
-                    f"materials, with the settings of its preset for that where none was given{but}; --set "
-                    "materials.fallback=false learns them all the same, for a scene that is to be lit anew."
-                )
-            )
-            _record(run, "none")
-            return
         _record(run, "split_sum")
     advice = (
         ""
-        if is_chosen or config.materials.recipe == "near_field"
+        if (is_chosen and is_whole) or config.materials.recipe == "near_field"
         else " For something shiny in a room there is --set materials.recipe=near_field."
     )
     run.progress(
@@ -166,6 +142,38 @@ def choose_materials(run: ReconstructionRun) -> None:
             f"unless the scene is to be lit anew.{advice}"
         )
     )
+
+
+def _choose_for_whole_photographs(run: ReconstructionRun, loss: str) -> bool:
+    """Choose mirrors of what stands near, or no materials, where ``loss`` tells what the trial has lost.
+
+    Returns:
+        Whether one of them was chosen: settings that were given may be possible with materials only.
+    """
+    run.progress(Noted(f"{loss}. Another one shows whether mirrors of what stands near explain them."))
+    near_gain_db = _trial_gain_db(run, "near_field")
+    if near_gain_db >= 0:
+        run.progress(
+            Warned(
+                f"{loss}, but {near_gain_db:.1f} dB better with materials.recipe=near_field, by which "
+                "mirrors show what stands near. That recipe is used; --set materials.fallback=false "
+                "keeps the other."
+            )
+        )
+        _record(run, "near_field")
+        return True
+    if _without_materials(run.config, run.given) is None:
+        return False
+    but = "" if run.given is not None else " that differs from those with materials"
+    run.progress(
+        Warned(
+            f"{loss}: little here reflects its surroundings clearly. The scene is trained without "
+            f"materials, with the settings of its preset for that where none was given{but}; --set "
+            "materials.fallback=false learns them all the same, for a scene that is to be lit anew."
+        )
+    )
+    _record(run, "none")
+    return True
 
 
 def _asks_for_choice(config: ReconstructionConfig) -> bool:

@@ -24,7 +24,7 @@ from octasplat.engine.shading.depth_split import DepthLayers, single_layer, spli
 from octasplat.engine.shading.environment_frame import environment_frame
 from octasplat.engine.shading.environment_light import EnvironmentLight
 from octasplat.engine.shading.gbuffer import GBuffer, RayOffset, backward_gbuffer, build_gbuffer
-from octasplat.engine.shading.geometry_losses import add_patch_gradients, normal_spread_gradient
+from octasplat.engine.shading.geometry_losses import add_surface_gradients, normal_spread_gradient
 from octasplat.engine.shading.gradient_ops import clip_gradients, srgb_derivative
 from octasplat.engine.shading.incident_light import (
     IncidentLightModel,
@@ -246,7 +246,7 @@ class DeferredShading:
         grad_normal = np.zeros((len(grad_rgb), 3))
         grad_features = np.zeros((len(grad_rgb), split.results.features.shape[1]))
         grad_depth = np.zeros(len(grad_rgb))
-        add_patch_gradients(traced, settings, grad_features, grad_alpha, grad_normal, grad_depth)
+        add_surface_gradients(traced, settings, grad_features, grad_alpha, grad_normal, grad_depth)
         grad_alpha, grad_normal = split.expand(grad_alpha), split.expand(grad_normal)
         grad_features, grad_depth = split.expand(grad_features), split.expand(grad_depth)
         # --- the split sum at the shaded points ---

@@ -23,6 +23,9 @@ _NEIGHBOR_SLICES = (((_ALL, _ALL, _FROM), (_ALL, _ALL, _TO)), ((_ALL, _FROM), (_
 """The two of each pair of neighbours in a grid of rays, across and down."""
 HUBER_DELTA = 0.02
 """Difference of materials at which their smoothness turns from a square to a straight line."""
+DARK_METAL_ALBEDO = (0.3, 0.7)
+"""Largest channel of the albedo up to which metallic costs all of its weight, and from which on nothing.
+Metals reflect about half of the light or more in some channel; the scale of albedos is only known roughly."""
 
 
 def normal_spread_gradient(
@@ -39,7 +42,7 @@ def normal_spread_gradient(
     grad_normal[gbuffer.ray_ids] -= weight * gbuffer.facing_normals.blended_world
 
 
-def add_patch_gradients(
+def add_surface_gradients(
     traced: TracedRays,
     settings: MaterialSettings,
     grad_features: Float64[np.ndarray, "r f"],
@@ -47,7 +50,7 @@ def add_patch_gradients(
     grad_normal: Float64[np.ndarray, "r 3"],
     grad_depth: Float64[np.ndarray, " r"],
 ) -> None:
-    """Add the gradients of all terms that hold neighbouring rays together: normals, depths, materials."""
+    """Add the gradients of all terms of surfaces as rays see them: normals, depths, materials."""
     if settings.depth_normal_weight > 0:
         add_depth_normal_gradient(traced, settings.depth_normal_weight, grad_alpha, grad_normal, grad_depth)
     if settings.smooth_normal_weight > 0:
@@ -56,6 +59,8 @@ def add_patch_gradients(
         add_material_smoothness_gradient(
             traced, settings.smooth_weights, settings.smooth_metal, grad_features, grad_alpha
         )
+    if settings.dark_metal_weight > 0:
+        add_dark_metal_gradient(traced, settings.dark_metal_weight, grad_features, grad_alpha)
 
 
 def add_depth_normal_gradient(
@@ -172,6 +177,27 @@ def add_material_smoothness_gradient(
     grad_flat = patches.flatten(gradient)
     grad_features[ray_ids, :5] += grad_flat / safe_alpha
     grad_alpha[ray_ids] -= (grad_flat * flat).sum(axis=1) / safe_alpha[:, 0]
+
+
+def add_dark_metal_gradient(
+    traced: TracedRays,
+    weight: float,
+    grad_features: Float64[np.ndarray, "r f"],
+    grad_alpha: Float64[np.ndarray, " r"],
+) -> None:
+    """Add the gradient of the mean metallic of surfaces, as far as they are darker than metals are.
+
+    Photographs hardly tell a rough metal from a matt thing of its color, so that metallic would stay where it
+    began. The albedo gets no gradient from that, nor does the share of each Gaussian in what is blended.
+    """
+    alpha = 1.0 - traced.result.transmittance.astype(np.float64)
+    counted = np.flatnonzero(alpha > MIN_ALPHA)
+    material = traced.result.features[counted, :4] / alpha[counted, None]
+    full, none = DARK_METAL_ALBEDO
+    darkness = np.clip((none - material[:, :3].max(axis=1)) / (none - full), 0.0, 1.0)
+    grad_metallic = weight / len(alpha) * darkness / alpha[counted]
+    grad_features[counted, 3] += grad_metallic
+    grad_alpha[counted] -= grad_metallic * material[:, 3]
 
 
 def _zero_outside(

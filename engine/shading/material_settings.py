@@ -194,6 +194,12 @@ class MaterialSettings(Settings):
         description="So many times more smooth_weight counts between metals, which are one color more "
         "often and which have what is reflected wrongly painted on.",
     )
+    dark_metal_weight: Annotated[float, Unit("weight"), ADVANCED] = Field(
+        0.0,
+        ge=0,
+        description="Weight of metallic in the loss where the albedo is darker than that of metals. Lower it "
+        "where a dark metal is taken for paint.",
+    )
     prune_unseen: Annotated[bool, ADVANCED] = Field(
         True,
         description="Take away Gaussians that lie in no photograph; reflected rays alone see those, so that "

@@ -5,7 +5,9 @@ import pytest
 
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.shading.geometry_losses import (
+    DARK_METAL_ALBEDO,
     HUBER_DELTA,
+    add_dark_metal_gradient,
     add_depth_normal_gradient,
     add_material_smoothness_gradient,
 )
@@ -102,6 +104,27 @@ def test_geometry_terms_ignore_translucent_pixels() -> None:
     found, by_alpha = np.zeros_like(features), np.zeros(SIDE**2)
     add_material_smoothness_gradient(sight(features, np.full(SIDE**2, 0.5)), WEIGHTS, METAL, found, by_alpha)
     assert (found == 0).all() and (by_alpha == 0).all()
+
+
+def test_dark_metal_gradient_with_albedo_fixed() -> None:
+    """The sum is that of metallic, of things as dark as paint wholly and of things as bright as metal not."""
+    rng = np.random.default_rng(2)
+    alpha = rng.uniform(0.92, 1.0, SIDE**2).astype(np.float32).astype(np.float64)
+    features = rng.uniform(0, 1, (SIDE**2, 5))
+    features[:, :3] *= np.linspace(0.1, 1.0, SIDE**2)[:, None]
+    full, none = DARK_METAL_ALBEDO
+    features[0, :3], features[1, :3] = full - 0.1, none + 0.1
+    features = (features * alpha[:, None]).astype(np.float32).astype(np.float64)
+    darkness = np.clip((none - (features[:, :3] / alpha[:, None]).max(axis=1)) / (none - full), 0, 1)
+    by_features, by_alpha = np.zeros_like(features), np.zeros_like(alpha)
+    add_dark_metal_gradient(sight(features, alpha), 0.5, by_features, by_alpha)
+    expected = 0.5 / SIDE**2 * darkness / alpha
+    np.testing.assert_allclose(by_features[:, 3], expected, rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(by_alpha, -expected * features[:, 3] / alpha, rtol=1e-5, atol=1e-9)
+    assert expected[0] > 0 and expected[1] == 0 and (by_features[:, [0, 1, 2, 4]] == 0).all()
+    found = np.zeros_like(features)
+    add_dark_metal_gradient(sight(features * 0.5, alpha * 0.5), 0.5, found, np.zeros_like(alpha))
+    assert (found == 0).all()  # translucent
 
 
 def test_sphere_normals_from_depths() -> None:

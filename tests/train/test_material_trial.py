@@ -82,9 +82,8 @@ def learnt(output: Path) -> str:
         (False, -7.0, 1.5, "near_field", "1.5 dB better with materials.recipe=near_field"),
         (False, -0.4, -0.1, "none", "trained without materials"),
         pytest.param(False, -0.2, 9.0, "split_sum", None, marks=pytest.mark.exhaustive),
-        pytest.param(True, -1.5, -0.1, "split_sum", "Leave out --materials", marks=pytest.mark.exhaustive),
         pytest.param(True, -0.9, 9.0, "split_sum", None, marks=pytest.mark.exhaustive),
-        pytest.param(True, -1.5, 0.1, "near_field", "0.1 dB better", marks=pytest.mark.exhaustive),
+        (True, -1.5, 0.1, "split_sum", "Leave out --materials"),
     ],
 )  # fmt: skip
 def test_long_training_learns_what_explains_the_photographs(
@@ -107,7 +106,7 @@ def test_long_training_learns_what_explains_the_photographs(
     loss = f"{-far_db:.1f} dB worse with materials than without"
     told = [message for message in warned if loss in message]
     assert len(told) == (sentence is not None) and (sentence is None or sentence in told[0])
-    assert tried == (["split_sum"] if sentence is None else ["split_sum", "near_field"])
+    assert tried == (["split_sum"] if sentence is None or is_thing else ["split_sum", "near_field"])
 
 
 def test_scene_that_materials_do_not_explain_is_as_without_them(

@@ -14,12 +14,14 @@ FLIP_NORMAL_COS = 0.5
 """Cosine beyond which normals that point away are turned, where materials are learnt."""
 SHORT_TRAINING = 5000
 """Iterations of a preset without materials up to which those with them take larger steps and grow sooner."""
-SHORT_EDGE_WEIGHT = 1.0
-"""``loss.edges`` of such a training with materials."""
 SHORT_MATERIAL_RATES = {"mean": 0.05, "log_scale": 0.04, "albedo": 0.08, "metallic": 0.05, "roughness": 0.05}
 """Learning rates of such a training."""
-SHORT_NORMAL_WEIGHT = 0.05
-"""Its ``materials.normal_weight`` and ``depth_normal_weight``, where rays for edges move the Gaussians."""
+EDGE_WEIGHT = 1.0
+"""``loss.edges`` with the recipe ``split_sum``."""
+DARK_METAL_WEIGHT = 0.02
+"""Its ``materials.dark_metal_weight``; ``near_field`` has its metallic stand for what is a mirror at all."""
+EDGE_NORMAL_WEIGHT = 0.05
+"""Its ``materials.normal_weight`` and ``depth_normal_weight``: rays for edges move the Gaussians, too."""
 
 
 def with_materials(config: TrainConfig, recipe: Recipe = "split_sum") -> TrainConfig:
@@ -28,7 +30,7 @@ def with_materials(config: TrainConfig, recipe: Recipe = "split_sum") -> TrainCo
     Reflections ask for normals to within a degree, so steps are small. Points lifted from photographs that
     show reflections lie behind the surface, so there are none. In a short training small steps do not get to
     where thin parts and textures are: all but those of the rotations are larger there. Rays for edges
-    (``loss.edges``), which ``split_sum`` alone has there, want harmonics that show colors by direction, and
+    (``loss.edges``), which ``split_sum`` alone has, want harmonics that show colors by direction, and
     allow more: larger rotations, weaker terms for smooth normals, twice as many Gaussians, and growth where
     the photographs differ.
 
@@ -37,7 +39,7 @@ def with_materials(config: TrainConfig, recipe: Recipe = "split_sum") -> TrainCo
         recipe: of the materials; the configuration does not name it.
     """
     is_short = 0 < config.iterations <= SHORT_TRAINING
-    has_edge_rays = is_short and recipe == "split_sum"
+    has_edge_rays = recipe == "split_sum"
     rates = {
         "quat": 1e-3,
         "mean": 0.016,
@@ -57,23 +59,28 @@ def with_materials(config: TrainConfig, recipe: Recipe = "split_sum") -> TrainCo
         "depth_split": 8.0,
     }
     if has_edge_rays:
-        materials.update(normal_weight=SHORT_NORMAL_WEIGHT, depth_normal_weight=SHORT_NORMAL_WEIGHT)
-    densify = McmcConfig(copies="area", stop_fraction=0.4, relocate_low_weight_below=0.0)
+        materials["dark_metal_weight"] = DARK_METAL_WEIGHT
+        materials.update(normal_weight=EDGE_NORMAL_WEIGHT, depth_normal_weight=EDGE_NORMAL_WEIGHT)
+    densify = McmcConfig(
+        copies="area",
+        error_power=1.0 if has_edge_rays else 0.0,
+        stop_fraction=0.4,
+        relocate_low_weight_below=0.0,
+    )
     if is_short:
-        growth = {"growth": 0.4, "stop_fraction": 0.5, "error_power": 1.0 if has_edge_rays else 0.0}
-        densify = densify.model_copy(update=growth)
+        densify = densify.model_copy(update={"growth": 0.4, "stop_fraction": 0.5})
     return config.model_copy(
         update={
             "materials": config.materials.model_copy(update=materials),
             "lr": config.lr.model_copy(update=rates),
             # Gaps under things that stand on a mirror would be filled with what looks like the reflection.
             "loss": config.loss.model_copy(
-                update={"free_space": 0.05, "edges": SHORT_EDGE_WEIGHT if has_edge_rays else None}
+                update={"free_space": 0.05, "edges": EDGE_WEIGHT if has_edge_rays else None}
             ),
             "plane_sweep_init": False,
             "normal_neighbors": 10,
             "sh_degree": min(config.sh_degree, 3 if has_edge_rays else 1),
-            "sh_degree_interval": 100 if has_edge_rays else 400,
+            "sh_degree_interval": 100 if is_short and has_edge_rays else 400,
             "rays_per_batch": 8192,
             "iterations": config.iterations * 14 // 25,  # which take longer by ray, and longer with light
             "rays_per_pixel": 8,
