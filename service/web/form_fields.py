@@ -219,6 +219,9 @@ def _control_of_array(name: str, schema: Mapping[str, Any]) -> Control:
 
 def _control_of_several(options: Sequence[Mapping[str, Any]]) -> tuple[Control, Sequence[str]]:
     """Return the control of a union of types: a choice where all values are known, else text."""
+    # a file is chosen, whatever else programs may send in its place
+    if any(option.get("format") == "octasplat-file" for option in options):
+        return "upload", ()
     values: list[str] = []
     for option in options:
         if option.get("type") == "null":

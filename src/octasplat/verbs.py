@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 from pydantic import BaseModel
 
+from octasplat.array_types import Matrix, Numbers
 from octasplat.engine.core.events import EventListener
 from octasplat.engine.operations.base import never_stop
 from octasplat.operation_calls import names_checked, run_operation
@@ -43,8 +44,8 @@ class RenderArguments(TypedDict, total=False):
     views: Literal["held-out", "train", "all"] | None
     photographs: Sequence[str] | None
     camera_path: BaseModel | Mapping[str, Any] | str | None
-    camera: Sequence[float] | None
-    look_at: Sequence[float] | None
+    camera: Numbers | None
+    look_at: Numbers | None
     distance: float | None
     elevation_degrees: float | None
     frames: int | None
@@ -95,7 +96,7 @@ def reconstruct(
     georeference: Literal["auto", "gps", "off"] | None = None,
     control_points: str | None = None,
     known_length: str | None = None,
-    region: Sequence[float] | None = None,
+    region: Numbers | None = None,
     minutes: float | None = None,
     exports: Sequence[str] | None = None,
     materials: bool = False,
@@ -268,7 +269,7 @@ def estimate(
     georeference: Literal["auto", "gps", "off"] | None = None,
     control_points: str | None = None,
     known_length: str | None = None,
-    region: Sequence[float] | None = None,
+    region: Numbers | None = None,
     minutes: float | None = None,
     exports: Sequence[str] | None = None,
     materials: bool = False,
@@ -419,7 +420,7 @@ def plan(
     georeference: Literal["auto", "gps", "off"] | None = None,
     control_points: str | None = None,
     known_length: str | None = None,
-    region: Sequence[float] | None = None,
+    region: Numbers | None = None,
     minutes: float | None = None,
     exports: Sequence[str] | None = None,
     materials: bool = False,
@@ -674,7 +675,7 @@ def surface(
     *,
     overwrite: bool = False,
     unbounded: bool | None = None,
-    bounds: Sequence[float] | str | None = None,
+    bounds: Numbers | str | None = None,
     voxel: float | None = None,
     resolution: int | None = None,
     truncation: float | None = None,
@@ -805,8 +806,8 @@ def material(
     set: BaseModel | Mapping[str, Any] | str | None = None,
     scale: BaseModel | Mapping[str, Any] | str | None = None,
     where: str | None = None,
-    box: Sequence[float] | None = None,
-    sphere: Sequence[float] | None = None,
+    box: Numbers | None = None,
+    sphere: Numbers | None = None,
     inverse: bool = False,
     mesh: PathLike | None = None,
     masks: Sequence[PathLike] | PathLike | None = None,
@@ -875,8 +876,8 @@ def render(
     views: Literal["held-out", "train", "all"] | None = None,
     photographs: Sequence[str] | None = None,
     camera_path: BaseModel | Mapping[str, Any] | str | None = None,
-    camera: Sequence[float] | None = None,
-    look_at: Sequence[float] | None = None,
+    camera: Numbers | None = None,
+    look_at: Numbers | None = None,
     distance: float | None = None,
     elevation_degrees: float | None = None,
     frames: int | None = None,
@@ -1026,8 +1027,8 @@ def relight(
     views: Literal["held-out", "train", "all"] | None = None,
     photographs: Sequence[str] | None = None,
     camera_path: BaseModel | Mapping[str, Any] | str | None = None,
-    camera: Sequence[float] | None = None,
-    look_at: Sequence[float] | None = None,
+    camera: Numbers | None = None,
+    look_at: Numbers | None = None,
     distance: float | None = None,
     elevation_degrees: float | None = None,
     frames: int | None = None,
@@ -1219,7 +1220,7 @@ def export(
     falloff_texture_size: int | None = None,
     ids: bool = True,
     q: float | None = None,
-    color: Literal["cameras", "constant"] | Sequence[float] | str | None = None,
+    color: Literal["cameras", "constant"] | Numbers | str | None = None,
     for_viewers: bool = False,
     extent: Literal["photographed", "all"] | None = None,
     materials: bool = False,
@@ -1506,12 +1507,12 @@ def transform(
     output: PathLike,
     *,
     overwrite: bool = False,
-    matrix: PathLike | None = None,
+    matrix: PathLike | Matrix | None = None,
     up: Sequence[Literal["x", "-x", "y", "-y", "z", "-z"]] | None = None,
     scale: float | None = None,
     rotate: Sequence[Sequence[Literal["x", "y", "z"] | float]] | None = None,
-    translate: Sequence[float] | None = None,
-    about: Sequence[float] | None = None,
+    translate: Numbers | None = None,
+    about: Numbers | None = None,
     progress: EventListener | None = None,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
@@ -1524,8 +1525,8 @@ def transform(
             writes a folder that is a run again, with what of it stays valid.
         overwrite: Replace files that are there already, too, which are not of an earlier run of this
             command or were changed since. What is read is never replaced.
-        matrix: A text file with an affine 4 x 4 or 3 x 4 matrix, row by row, that maps old points to
-            new ones.
+        matrix: An affine 4 x 4 or 3 x 4 matrix that maps old points to new ones, row by row: a text
+            file or, in Python and JSON, its rows.
         up: Turn the axis that points up to another: -y z from COLMAP's usual frame to Blender's.
         scale: Scale by a factor.
         rotate: Turn about an axis, counter-clockwise seen from its tip; may be repeated.
@@ -1541,6 +1542,9 @@ def transform(
     >>> import octasplat as osp
     >>> osp.transform("scene.ply", "moved.ply", translate=(0, 0, 1), scale=2).count
     1200
+    >>> import numpy as np
+    >>> osp.transform("scene.ply", "mirrored.ply", matrix=np.diag([-1, 1, 1, 1])).matrix[0]
+    (-1.0, 0.0, 0.0, 0.0)
     """
     return run_operation(
         "transform",
@@ -1568,8 +1572,8 @@ def crop(
     *,
     overwrite: bool = False,
     where: str | None = None,
-    box: Sequence[float] | None = None,
-    sphere: Sequence[float] | None = None,
+    box: Numbers | None = None,
+    sphere: Numbers | None = None,
     inverse: bool = False,
     progress: EventListener | None = None,
     should_stop: Callable[[], bool] = never_stop,
@@ -1619,7 +1623,7 @@ def crop(
 
 @names_checked
 def merge(
-    source: PathLike,
+    source: Sequence[PathLike] | PathLike,
     output: PathLike,
     scenes: Sequence[PathLike] | PathLike | None = None,
     *,
@@ -1632,7 +1636,8 @@ def merge(
     """Put scenes together.
 
     Args:
-        source: The scene to read: a file of any format, or the folder of a run.
+        source: The first scene: a file of any format, or the folder of a run. Python also takes a list
+            of all scenes here.
         output: The scene to write; the suffix says in which format. Of a run, a name without suffix
             writes a folder that is a run again, with what of it stays valid.
         scenes: The other scenes: files of any format, each in the same frame.
@@ -1647,8 +1652,8 @@ def merge(
         OctasplatError: something cannot be read, done or written; the text says what.
 
     >>> import octasplat as osp
-    >>> len(osp.load(osp.merge("scene.ply", "both.ply", ["shiny.ply"]).files[0]))
-    2400
+    >>> osp.merge(["scene.ply", "shiny.ply"], "both.ply").counts
+    (1200, 1200)
     """
     return run_operation(
         "merge",

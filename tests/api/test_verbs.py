@@ -1,6 +1,7 @@
 """The functions of verbs are those that their requests say."""
 
 import inspect
+import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -173,11 +174,73 @@ def test_values_of_another_kind_are_refused_in_plain_words(scene_file: Path, tmp
         osp.ConfigError, match=r"^source: must be the path of a file or folder, not a Scene; wr"
     ):
         osp.crop(scene, target, sphere=(0, 0, 0, 1))  # type: ignore[arg-type]
-    with pytest.raises(osp.ConfigError, match=r"^matrix: must be the path of a file or folder, not a list"):
-        osp.transform(scene_file, target, matrix=np.eye(4))  # type: ignore[arg-type]
+    with pytest.raises(osp.ConfigError, match=r"^matrix: must be a 4 x 4 or 3 x 4 matrix of numbers, or"):
+        osp.transform(scene_file, target, matrix=scene)  # type: ignore[arg-type]
     with pytest.raises(osp.ConfigError, match=r"^up: must be a list, not a str"):
         osp.transform(scene_file, target, up="z")  # type: ignore[arg-type]
     with pytest.raises(osp.ConfigError, match=r"^threads: must be 0"):
         osp.crop(scene_file, target, sphere=(0, 0, 0, 1), threads=-1)
     with pytest.raises(TypeError, match="save takes a scene"):
         osp.save(scene_file, target)  # type: ignore[arg-type]
+
+
+def test_matrix_of_numbers_moves_as_that_of_a_file_does(scene_file: Path, tmp_path: Path) -> None:
+    matrix = np.array([[0.0, -2, 0, 1], [2, 0, 0, 2], [0, 0, 2, 3], [0, 0, 0, 1]])
+    np.savetxt(tmp_path / "matrix.txt", matrix)
+    by_file = osp.transform(scene_file, tmp_path / "file.ply", matrix=tmp_path / "matrix.txt")
+    expected = (tmp_path / "file.ply").read_bytes()
+    for number, given in enumerate(
+        (matrix, matrix.astype(np.float32), matrix[:3], matrix.tolist(), tuple(matrix[:3]))
+    ):
+        target = tmp_path / f"{number}.ply"
+        assert osp.transform(scene_file, target, matrix=given).matrix == by_file.matrix
+        assert target.read_bytes() == expected
+
+
+@pytest.mark.parametrize(
+    ("matrix", "sentence"),
+    [
+        (np.eye(3), r"must be a 4 x 4 or 3 x 4 matrix, .* what is given is 3 x 3\.$"),
+        (np.zeros((2, 4, 4)), r"what is given is 2 x 4 x 4\.$"),
+        (np.arange(16), r"what is given is 16\.$"),
+        ([[1, 0, 0, 0], [0, 1, 0]], "must be a 4 x 4 or 3 x 4 matrix of numbers"),
+        ([["a"] * 4] * 4, "must be a 4 x 4 or 3 x 4 matrix of numbers"),
+        (3.0, "what is given is a single number"),
+        (np.full((4, 4), np.nan), "must have finite numbers only"),
+        (np.full((3, 4), np.inf), "must have finite numbers only"),
+        (np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [5, 0, 0, 1]]), "the last row 0 0 0 1"),
+        (np.diag([1.0, 1, 0, 1]), "flattens space"),
+    ],
+)
+def test_what_is_no_affine_matrix_is_refused_in_one_sentence(
+    matrix: Any, sentence: str, scene_file: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(osp.ConfigError, match=sentence) as refused:
+        osp.transform(scene_file, tmp_path / "a.ply", matrix=matrix)
+    assert "\n" not in str(refused.value) and not (tmp_path / "a.ply").exists()
+
+
+def test_sheared_run_says_what_is_lost(in_folder: Path) -> None:
+    """A matrix that is no similarity is taken, by numbers as by a file."""
+    sheared, told = np.eye(4), []
+    sheared[0, 1] = 0.5
+    osp.transform("run", "sheared", matrix=sheared, progress=told.append)
+    assert any(isinstance(event, Warned) and "mirrored, sheared or" in event.message for event in told)
+    record = json.loads(Path("sheared/edits.json").read_text())[-1]
+    assert record["matrix"] == sheared.tolist()[:4]
+
+
+def test_merge_takes_a_list_of_all_scenes(in_folder: Path) -> None:
+    osp.crop("scene.ply", "half.ply", where="z < 0")
+    assert osp.merge(["scene.ply", "half.ply"], "two.ply").counts == (1200, 600)
+    assert osp.merge("scene.ply", "same.ply", ["half.ply"]).counts == (1200, 600)
+    assert Path("two.ply").read_bytes() == Path("same.ply").read_bytes()
+    three = osp.merge((Path("scene.ply"), osp.Run("run")), "three.ply", "half.ply")
+    assert three.counts[0] == 1200 and three.counts[2] == 600
+    for few in ([], ["scene.ply"]):
+        with pytest.raises(osp.ConfigError, match="Name at least two scenes"):
+            osp.merge(few, "none.ply")
+    with pytest.raises(osp.ConfigError, match="write the scene to a file first"):
+        osp.merge([osp.load("scene.ply"), osp.load("half.ply")], "none.ply")  # type: ignore[list-item]
+    with pytest.raises(osp.ConfigError, match="would overwrite"):
+        osp.merge(["scene.ply", "half.ply"], "half.ply")
