@@ -47,8 +47,8 @@ class MergeRequest(MergeOptions, SceneRequest):
     """
 
     source: Annotated[Source, AlsoSequence()] = Field(
-        description="The first scene: a file of any format, or the folder of a run. Python also takes a list of "
-        "all scenes here."
+        description="The first scene: a file of any format, or the folder of a run. Python also takes a "
+        "list of all scenes here."
     )
 
     @model_validator(mode="before")

@@ -58,8 +58,8 @@ class TransformOptions(Options):
     matrix: Annotated[InputFile | _Rows | None, WrapValidator(_checked_matrix), Spelling(metavar="FILE")] = (
         Field(
             None,
-            description="An affine 4 x 4 or 3 x 4 matrix that maps old points to new ones, row by row: a text file "
-            "or, in Python and JSON, its rows.",
+            description="An affine 4 x 4 or 3 x 4 matrix that maps old points to new ones, row by row: a "
+            "text file or, in Python and JSON, its rows.",
         )
     )
     up: Annotated[tuple[Axis, Axis] | None, Spelling(metavar="OLD NEW")] = Field(

@@ -37,7 +37,7 @@ class Image:
 
     >>> import octasplat as osp
     >>> scene = osp.load("scene.ply")
-    >>> image = osp.render(scene, scene.camera(width=96, height=64))
+    >>> image = osp.render(scene, scene.camera(width_px=96, height_px=64))
     >>> image.rgb.shape, image.depth.shape, image.normal.shape, image.alpha.shape
     ((64, 96, 3), (64, 96), (64, 96, 3), (64, 96))
     >>> image.gaussian.shape, int(image.gaussian.max()) < len(scene)
@@ -72,7 +72,7 @@ class Image:
 
         >>> import octasplat as osp
         >>> scene = osp.load("scene.ply")
-        >>> osp.render(scene, scene.camera(width=96, height=64)).save("view.png").name
+        >>> osp.render(scene, scene.camera(width_px=96, height_px=64)).save("view.png").name
         'view.png'
         """
         from octasplat.engine.render.image_files import exr_layers, write_exr, write_png

@@ -213,18 +213,25 @@ class Scene:
 
         return self.trained_with or TraceSettings(flip_normal_cos=self.facts.turned_beyond)
 
-    def camera(self, width: int = 640, height: int = 480, *, fov: float | None = None) -> "PinholeCamera":
+    def camera(
+        self, width_px: int = 640, height_px: int = 480, *, fov_y_degrees: float | None = None
+    ) -> "PinholeCamera":
         """Return the first camera of :meth:`turntable`.
 
         >>> import octasplat as osp
-        >>> camera = osp.load("scene.ply").camera(width=96, height=64)
+        >>> camera = osp.load("scene.ply").camera(width_px=96, height_px=64)
         >>> camera.width_px, camera.height_px
         (96, 64)
         """
-        return self.turntable(1, width, height, fov=fov)[0]
+        return self.turntable(1, width_px, height_px, fov_y_degrees=fov_y_degrees)[0]
 
     def turntable(
-        self, frames: int, width: int = 640, height: int = 480, *, fov: float | None = None
+        self,
+        frames: int,
+        width_px: int = 640,
+        height_px: int = 480,
+        *,
+        fov_y_degrees: float | None = None,
     ) -> tuple["PinholeCamera", ...]:
         """Return cameras that go round the scene once, as those of :func:`octasplat.render` do.
 
@@ -234,9 +241,9 @@ class Scene:
 
         Args:
             frames: how many cameras.
-            width: of their images, px.
-            height: of their images, px.
-            fov: angle of view from top to bottom, degrees; by default that of the photographs, or 50.
+            width_px: of their images.
+            height_px: of their images.
+            fov_y_degrees: angle of view from top to bottom; by default that of the photographs, or 50.
 
         Raises:
             ConfigError: there are no frames, or an image has no pixels or no field of view.
@@ -248,9 +255,9 @@ class Scene:
         from octasplat.engine.render.orbit import Orbit, PinholeLens, choose_fov_y_degrees, orbit_cameras
         from octasplat.engine.render.pinhole_camera import check_lens
 
-        angle = choose_fov_y_degrees(fov, self.viewpoints)
-        check_lens(width, height, angle)
-        lens, orbit = PinholeLens(width, height, angle), Orbit(np.array([0.0, -1.0, 0.0]))
+        angle = choose_fov_y_degrees(fov_y_degrees, self.viewpoints)
+        check_lens(width_px, height_px, angle)
+        lens, orbit = PinholeLens(width_px, height_px, angle), Orbit(np.array([0.0, -1.0, 0.0]))
         try:
             cameras = orbit_cameras(self.gaussians, self.viewpoints, lens, orbit, frames)
         except ConfigError:

@@ -89,7 +89,7 @@ class Rays:
         t_max: distance at which they end.
 
     >>> import octasplat as osp
-    >>> rays = osp.Rays.of(osp.load("scene.ply").camera(width=96, height=64))
+    >>> rays = osp.Rays.of(osp.load("scene.ply").camera(width_px=96, height_px=64))
     >>> rays.origins.shape, rays.directions.shape
     (torch.Size([1, 3]), torch.Size([6144, 3]))
     >>> rays[:100].directions.shape
@@ -134,7 +134,7 @@ class TracedRays:
 
     >>> import octasplat as osp
     >>> scene = osp.load("scene.ply")
-    >>> seen = osp.trace(scene, scene.camera(width=96, height=64))
+    >>> seen = osp.trace(scene, scene.camera(width_px=96, height_px=64))
     >>> picture = (seen.rgb + (1 - seen.alpha)[:, None]).reshape(64, 96, 3)  # over white
     >>> picture.shape
     torch.Size([64, 96, 3])
@@ -171,7 +171,7 @@ def trace(
     >>> import octasplat as osp
     >>> scene = osp.load("scene.ply")
     >>> parameters = osp.GaussianTensors.of(scene)
-    >>> seen = osp.trace(parameters, scene.camera(width=96, height=64))
+    >>> seen = osp.trace(parameters, scene.camera(width_px=96, height_px=64))
     >>> seen.rgb.shape, seen.depth.shape, seen.normal.shape, seen.alpha.shape
     (torch.Size([6144, 3]), torch.Size([6144]), torch.Size([6144, 3]), torch.Size([6144]))
     >>> (1 - seen.alpha).mean().backward()

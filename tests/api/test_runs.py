@@ -143,7 +143,7 @@ def test_scene_of_run_is_traced_as_the_run_was(finished_run: Path, tmp_path: Pat
     content["reconstruction"]["train"]["trace"] |= {"q": 4.0, "transmittance_min": 0.3}
     (run / "config.json").write_text(json.dumps(content))
     scene = osp.load(run)
-    camera = scene.camera(width=48, height=36, fov=50.0)
+    camera = scene.camera(width_px=48, height_px=36, fov_y_degrees=50.0)
     pose = {"camera_to_world": camera.world_from_cam.tolist(), "fov_y_degrees": 50.0}
     path = {"width": 48, "height": 36, "frames": [pose]}
     osp.render(run, tmp_path / "shown.exr", camera_path=path, background="black")

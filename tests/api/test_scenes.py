@@ -71,7 +71,7 @@ def test_what_is_no_picture_is_refused(scene_file: Path) -> None:
             osp.view(scene, open_browser=False, **place)
     for size, fov in (((0, 12), 50.0), ((16, 12), 200.0), ((16, 12), 0.0)):
         with pytest.raises(osp.ConfigError, match=r"must be at least 1|between 0 and 180"):
-            scene.camera(*size, fov=fov)
+            scene.camera(*size, fov_y_degrees=fov)
         with pytest.raises(osp.ConfigError, match=r"must be at least 1|between 0 and 180"):
             osp.Camera.looking_at((0, 0, -4), (0, 0, 0), *size, fov_y_degrees=fov)
 
@@ -119,7 +119,7 @@ def test_picture_shows_the_near_side_of_a_ball(scene_file: Path) -> None:
 def test_results_have_a_page_for_notebooks(scene_file: Path) -> None:
     scene = osp.load(scene_file)
     assert "1,200" in scene._repr_html_()
-    image = osp.render(scene, scene.camera(width=32, height=24))
+    image = osp.render(scene, scene.camera(width_px=32, height_px=24))
     assert image._repr_html_().startswith('<img src="data:image/png;base64,')
     assert image._repr_png_().startswith(b"\x89PNG")
 
@@ -128,7 +128,7 @@ def test_saved_pictures_are_read_back(scene_file: Path, tmp_path: Path) -> None:
     from octasplat.engine.render.image_files import read_image
 
     scene = osp.load(scene_file)
-    image = osp.render(scene, scene.camera(width=32, height=24))
+    image = osp.render(scene, scene.camera(width_px=32, height_px=24))
     found = read_image(image.save(tmp_path / "a.png"))
     np.testing.assert_allclose(found[..., :3], image.rgb, atol=0.5 / 255 + 1e-6)
     assert image.save(tmp_path / "a.exr").stat().st_size > 0

@@ -163,7 +163,7 @@ def test_scene_tensors_keep_metadata(scene_file: Path) -> None:
     scene = osp.Scene(osp.load(scene_file).gaussians, SceneMetadata(turned_beyond=0.5, near_world=0.1))
     tensors = osp.GaussianTensors.of(scene)
     assert tensors.scene().facts == scene.facts
-    camera = scene.camera(width=48, height=32)
+    camera = scene.camera(width_px=48, height_px=32)
     expected, found = osp.trace(scene, camera), osp.trace(tensors, camera)
     unturned = osp.trace(osp.Scene(scene.gaussians), camera)
     assert not torch.equal(expected.normal, unturned.normal)  # so that it matters
