@@ -76,8 +76,8 @@ class TransformOptions(Options):
         max_length=100,
         description="Turn about an axis, counter-clockwise seen from its tip; may be repeated.",
     )
-    translate: Annotated[_Point | None, Unit("world")] = Field(None, description="Move.")
-    about: Annotated[_Point, Unit("world")] = Field(
+    translate: Annotated[_Point | None, Unit("scene units")] = Field(None, description="Move.")
+    about: Annotated[_Point, Unit("scene units")] = Field(
         (0.0, 0.0, 0.0), description="The point that up, scale and rotate leave where it is."
     )
 

@@ -107,8 +107,8 @@ def reconstruct(
     sh_degree: int | None = None,
     seed: int | None = None,
     train: Mapping[str, Any] | None = None,
-    assignments: Sequence[str] | None = None,
-    frames_per_second: float | None = None,
+    set: Sequence[str] | Mapping[str, Any] | str | None = None,
+    fps: float | None = None,
     start_from: PathLike | None = None,
     resume: bool = False,
     on_step: OnStep | None = None,
@@ -179,10 +179,9 @@ def reconstruct(
         sh_degree: Degree of the spherical harmonics of the colors, 0 to 3.
         seed: Seed of everything random. [default: 0]
         train: Settings of the training that are to be otherwise than the preset's.
-        assignments: Any other setting, e.g. lr.quat=0.02 or test_every=4, values as JSON; octasplat
-            config list shows them.
-        frames_per_second: Of a video: so many frames of each second are taken, the sharpest ones.
-            Default: 2.0.
+        set: Any other setting, e.g. lr.quat=0.02 or test_every=4, values as JSON; octasplat config list
+            shows them.
+        fps: Of a video: so many frames of each second are taken, the sharpest ones. Default: 2.0.
         start_from: Begin with the Gaussians of that run, finished or stopped, or of a file of
             Gaussians, instead of the sparse points; poses that the run found are taken, too.
         resume: Go on with the run in the output folder, if there is one; without other options its own
@@ -237,10 +236,10 @@ def reconstruct(
             "sh_degree": sh_degree,
             "seed": seed,
             "train": train,
-            "assignments": assignments,
+            "set": set,
             "source": source,
             "output": output,
-            "frames_per_second": frames_per_second,
+            "fps": fps,
             "start_from": start_from,
             "resume": resume,
         },
@@ -280,9 +279,9 @@ def estimate(
     sh_degree: int | None = None,
     seed: int | None = None,
     train: Mapping[str, Any] | None = None,
-    assignments: Sequence[str] | None = None,
+    set: Sequence[str] | Mapping[str, Any] | str | None = None,
     cores: int | None = None,
-    frames_per_second: float | None = None,
+    fps: float | None = None,
     progress: EventListener | None = None,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
@@ -344,10 +343,10 @@ def estimate(
         sh_degree: Degree of the spherical harmonics of the colors, 0 to 3.
         seed: Seed of everything random. [default: 0]
         train: Settings of the training that are to be otherwise than the preset's.
-        assignments: Any other setting, e.g. lr.quat=0.02 or test_every=4, values as JSON; octasplat
-            config list shows them.
+        set: Any other setting, e.g. lr.quat=0.02 or test_every=4, values as JSON; octasplat config list
+            shows them.
         cores: Cores of the machine to reckon with; 0 takes those of this one. Default: 0.
-        frames_per_second: Of a video: so many frames of each second would be taken. Default: 2.0.
+        fps: Of a video: so many frames of each second would be taken. Default: 2.0.
         progress: told each event; by default they are logged, or shown in a notebook.
         should_stop: asked now and then; True ends the work with ``CancelledError``.
         threads: number of threads; 0 takes all cores. The result does not depend on it.
@@ -388,10 +387,10 @@ def estimate(
             "sh_degree": sh_degree,
             "seed": seed,
             "train": train,
-            "assignments": assignments,
+            "set": set,
             "cores": cores,
             "source": source,
-            "frames_per_second": frames_per_second,
+            "fps": fps,
         },
         progress,
         should_stop,
@@ -431,7 +430,7 @@ def plan(
     sh_degree: int | None = None,
     seed: int | None = None,
     train: Mapping[str, Any] | None = None,
-    assignments: Sequence[str] | None = None,
+    set: Sequence[str] | Mapping[str, Any] | str | None = None,
     cores: int | None = None,
     picture: PathLike | None = None,
     progress: EventListener | None = None,
@@ -502,8 +501,8 @@ def plan(
         sh_degree: Degree of the spherical harmonics of the colors, 0 to 3.
         seed: Seed of everything random. [default: 0]
         train: Settings of the training that are to be otherwise than the preset's.
-        assignments: Any other setting, e.g. lr.quat=0.02 or test_every=4, values as JSON; octasplat
-            config list shows them.
+        set: Any other setting, e.g. lr.quat=0.02 or test_every=4, values as JSON; octasplat config list
+            shows them.
         cores: Cores of the machine to reckon with; 0 takes those of this one. Default: 0.
         picture: Write a map of the points from above, a color a block, and of the cameras, in black.
         progress: told each event; by default they are logged, or shown in a notebook.
@@ -549,7 +548,7 @@ def plan(
             "sh_degree": sh_degree,
             "seed": seed,
             "train": train,
-            "assignments": assignments,
+            "set": set,
             "cores": cores,
             "source": source,
             "picture": picture,
@@ -675,7 +674,7 @@ def surface(
     *,
     overwrite: bool = False,
     unbounded: bool | None = None,
-    bounds: Numbers | str | None = None,
+    box: Numbers | None = None,
     voxel: float | None = None,
     resolution: int | None = None,
     truncation: float | None = None,
@@ -711,8 +710,8 @@ def surface(
         overwrite: Replace files that are there already, too, which are not of an earlier run of this
             command or were changed since. What is read is never replaced.
         unbounded: Reach to the horizon, with ever coarser voxels, instead of meshing a box.
-        bounds: The box to mesh, in scene units; octasplat info tells where the scene lies. [default:
-            what is seen of the space that the cameras surround]
+        box: Two corners of the box to mesh, smallest coordinates first; octasplat info tells where the
+            scene lies. [default: what is seen of the space that the cameras surround]
         voxel: Side of a voxel, in scene units, at the centre where unbounded. [default: as resolution
             says]
         resolution: Voxels along the longest side of the box. [default: 512, or fewer where a voxel
@@ -737,7 +736,7 @@ def surface(
         texture_size: Colors in a square texture of this side instead of in the vertices; .glb, .obj and
             .usdz.
         max_memory_gb: Refuse a volume that takes more memory than this. Default: 4.0.
-        room: What pictures of a room need, where nothing else is said: unbounded (not with bounds),
+        room: What pictures of a room need, where nothing else is said: unbounded (not with a box),
             unseen solid, backdrop, refine_vertices, and finer voxels than a box has.
         max_triangles: Decimate to so many triangles, such as 60000 or 60k; 5k,50k,500k writes a file
             each, NAME_5k.glb. [default: all]
@@ -764,7 +763,7 @@ def surface(
         {
             "overwrite": overwrite,
             "unbounded": unbounded,
-            "bounds": bounds,
+            "box": box,
             "voxel": voxel,
             "resolution": resolution,
             "truncation": truncation,
@@ -804,7 +803,7 @@ def material(
     *,
     overwrite: bool = False,
     set: BaseModel | Mapping[str, Any] | str | None = None,
-    scale: BaseModel | Mapping[str, Any] | str | None = None,
+    multiply: BaseModel | Mapping[str, Any] | str | None = None,
     where: str | None = None,
     box: Numbers | None = None,
     sphere: Numbers | None = None,
@@ -824,7 +823,7 @@ def material(
             command or were changed since. What is read is never replaced.
         set: Values to set: albedo=R,G,B (linear, 0 to 1), albedo=#rrggbb (display), metallic=0..1 or
             roughness=0..1.
-        scale: Factors to multiply albedo, metallic or roughness by; the result is at most 1.
+        multiply: Factors to multiply albedo, metallic or roughness by; the result is at most 1.
         where: Comparisons joined by and, or, not that hold for them, of x, y, z, opacity and channels
             such as metallic, roughness and albedo.r: 'metallic > 0.5 and z < 0'.
         box: Two corners of a box that their centres lie in, smallest coordinates first.
@@ -852,7 +851,7 @@ def material(
             "source": source,
             "output": output,
             "set": set,
-            "scale": scale,
+            "multiply": multiply,
             "where": where,
             "box": box,
             "sphere": sphere,
@@ -1300,7 +1299,7 @@ def export(
 
 @names_checked
 def import_(
-    file: PathLike,
+    source: PathLike,
     output: PathLike,
     *,
     overwrite: bool = False,
@@ -1315,7 +1314,7 @@ def import_(
     """Splats of any format to a scene of flat Gaussians.
 
     Args:
-        file: The scene to read, a file of any known format.
+        source: The scene to read, a file of any known format.
         output: The scene to write.
         overwrite: Replace files that are there already, too, which are not of an earlier run of this
             command or were changed since. What is read is never replaced.
@@ -1340,7 +1339,7 @@ def import_(
         "import",
         {
             "overwrite": overwrite,
-            "file": file,
+            "source": source,
             "format": format,
             "drop_invalid": drop_invalid,
             "sh_degree": sh_degree,

@@ -55,7 +55,14 @@ def test_folder_without_a_run_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "options", [{"preset": "fastest"}, {"assignments": ["iteratoins=3"]}, {"train": {"raise": 3}}]
+    "options",
+    [
+        {"preset": "fastest"},
+        {"set": ["iteratoins=3"]},
+        {"set": {"iteratoins": 3}},
+        {"set": "lr.quat"},
+        {"train": {"raise": 3}},
+    ],
 )
 def test_refused_settings_have_the_sentence_of_the_command(
     options: dict[str, Any], photographs: Path, tmp_path: Path
@@ -173,7 +180,7 @@ def test_viewer_of_run_has_cameras(finished_run: Path) -> None:
 
 
 def test_resume_ignores_empty_settings(photographs: Path, finished_run: Path) -> None:
-    run = osp.reconstruct(photographs, finished_run, resume=True, train={}, assignments=[])
+    run = osp.reconstruct(photographs, finished_run, resume=True, train={}, set=[])
     assert run.is_finished
 
 

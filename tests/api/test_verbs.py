@@ -16,6 +16,7 @@ from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.events import Event, PhaseProgress, Warned
 from octasplat.engine.operations.base import build_request
 from octasplat.engine.operations.registry import operation, operation_names
+from octasplat.engine.settings.fields import Spelling, Unit
 from octasplat.operation_calls import explicit_values
 
 
@@ -244,3 +245,50 @@ def test_merge_takes_a_list_of_all_scenes(in_folder: Path) -> None:
         osp.merge([osp.load("scene.ply"), osp.load("half.ply")], "none.ply")  # type: ignore[list-item]
     with pytest.raises(osp.ConfigError, match="would overwrite"):
         osp.merge(["scene.ply", "half.ply"], "half.ply")
+
+
+def test_settings_by_name_are_those_of_texts() -> None:
+    request = operation("reconstruct").request
+    quat = np.float32(0.25)
+    texts = ["lr.quat=0.25", "test_every=4", "exposure=true", "background=white"]
+    by_name = {"lr.quat": quat, "test_every": np.int64(4), "exposure": True, "background": "white"}
+    configs = [
+        build_request(
+            request, explicit_values(request, {"source": "photos", "output": "out", "set": given})
+        ).config()
+        for given in (texts, tuple(texts), by_name)
+    ]
+    assert configs[0] == configs[1] == configs[2]
+    assert configs[0].train.lr.quat == 0.25 and configs[0].test_every == 4
+    alone = explicit_values(request, {"source": "photos", "output": "out", "set": "lr.quat=0.25"})
+    assert build_request(request, alone).config().train.lr.quat == 0.25
+
+
+def test_one_name_has_one_meaning_and_one_unit_in_all_verbs() -> None:
+    """Names of options, of Python and of the fields of jobs are the same; so are their units."""
+    units: dict[str, set[str]] = {}
+    flags: dict[str, set[str]] = {}
+    for name in operation_names():
+        for field, info in operation(name).request.model_fields.items():
+            unit = next((mark.symbol for mark in info.metadata if isinstance(mark, Unit)), "")
+            units.setdefault(field, set()).add(unit)
+            spellings = [mark for mark in info.metadata if isinstance(mark, Spelling)]
+            if any(spelling.hidden for spelling in spellings):
+                continue
+            own = [flag for spelling in spellings for flag in spelling.flags]
+            for flag in own or ["--" + field.replace("_", "-")]:
+                flags.setdefault(flag, set()).add(field)
+    assert {field: found for field, found in units.items() if len(found) > 1} == {}
+    # the mesh that chooses Gaussians, and the edited ones
+    assert {flag: found for flag, found in flags.items() if len(found) > 1} == {"--mesh": {"mesh", "meshes"}}
+    angles = {field for field, found in units.items() if found == {"degrees"}}
+    assert all(field.endswith("_degrees") for field in angles - {"rotate"})  # whose values name the axis, too
+
+
+def test_cameras_of_a_scene_have_the_names_of_all_others(scene_file: Path) -> None:
+    scene, shared = osp.load(scene_file), {"width_px", "height_px", "fov_y_degrees"}
+    for function in (scene.camera, scene.turntable, osp.Camera.looking_at, octasplat.verbs.render):
+        assert shared <= set(inspect.signature(function).parameters)
+    camera = scene.camera(width_px=96, height_px=48, fov_y_degrees=60)
+    assert (camera.width_px, camera.height_px) == (96, 48)
+    assert np.degrees(2 * np.arctan(24 / camera.fy_px)) == pytest.approx(60)

@@ -152,7 +152,7 @@ def test_preview_job_is_one_picture(run, octasplat, tmp_path):
     [
         (
             {"frames": 2, "spin": True, "rotation_degrees": 20, "clamp": 0.4, **SIZE},
-            ("--turntable", "--frames", 2, "--spin", "--rotate", 20, "--clamp", 0.4, *SIZE_WORDS),
+            ("--turntable", "--frames", 2, "--spin", "--rotation", 20, "--clamp", 0.4, *SIZE_WORDS),
             "turn.mp4",
         ),
         (
