@@ -1,7 +1,6 @@
 """Folders of finished runs with a changed scene, without the measurements of the original."""
 
 import json
-import os
 import shutil
 from collections.abc import Mapping
 from dataclasses import replace
@@ -12,6 +11,7 @@ from jaxtyping import Float
 
 from octasplat.engine.core.errors import OutputError
 from octasplat.engine.core.georeference import GEOREFERENCE_FILE, is_similarity, write_georeference
+from octasplat.engine.core.partial_folders import partial_folder
 from octasplat.engine.core.writing import report_disk_full, write_json
 from octasplat.engine.edit.run_transform import write_transformed_run_files
 from octasplat.engine.files import read_metadata
@@ -80,11 +80,9 @@ def write_edited_run(
     """
     check_new_run(target)
     metadata = facts or read_metadata(source)
-    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
     messages: tuple[str, ...] = ()
     try:
-        with report_disk_full(target):
-            partial.mkdir(parents=True)
+        with report_disk_full(target), partial_folder(target) as partial:
             if matrix is None:
                 _copy(source, partial)
             elif is_similarity(matrix):
@@ -101,8 +99,6 @@ def write_edited_run(
             partial.replace(target)
     except OSError as error:
         raise OutputError(f"{target} cannot be written ({error.strerror or error}).") from None
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     return messages
 
 
