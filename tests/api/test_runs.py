@@ -140,7 +140,7 @@ def test_notebook_shows_progress_and_ends_with_lines() -> None:
 def test_run_images_match_operation_result(finished_run: Path, tmp_path: Path) -> None:
     found = osp.render(osp.Run(finished_run), tmp_path / "views", views="held-out")
     assert found.images == 2 and all(path.is_file() for path in found.files)
-    with pytest.raises(TypeError, match="goes with a camera"):
+    with pytest.raises(TypeError, match="goes with one camera"):
         osp.render(osp.load(finished_run), tmp_path / "views")  # type: ignore[call-overload]
 
 
@@ -203,3 +203,10 @@ def test_scene_is_rendered_from_where_a_photograph_was_taken(finished_run: Path)
     seen = osp.render(run.scene, run.cameras["view_008.png"]).rgb
     stored = read_image(finished_run / "renders" / "view_008.png")[..., :3]
     np.testing.assert_allclose(seen, stored, atol=0.6 / 255)
+
+
+def test_edited_run_is_finished_and_not_measured(in_folder: Path) -> None:
+    osp.crop("run", "half", where="z < 0")
+    half = osp.Run("half")
+    assert half.is_finished and half.psnr is None and repr(half) == "Run('half', not measured)"
+    assert osp.evaluate(half).psnr == half.psnr

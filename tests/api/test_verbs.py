@@ -292,3 +292,15 @@ def test_cameras_of_a_scene_have_the_names_of_all_others(scene_file: Path) -> No
     camera = scene.camera(width_px=96, height_px=48, fov_y_degrees=60)
     assert (camera.width_px, camera.height_px) == (96, 48)
     assert np.degrees(2 * np.arctan(24 / camera.fy_px)) == pytest.approx(60)
+
+
+def test_too_few_and_too_many_values_are_told_in_plain_words(scene_file: Path, tmp_path: Path) -> None:
+    target = tmp_path / "a.ply"
+    with pytest.raises(
+        osp.ConfigError, match=r"^box\.5: is missing; the 5 values that are given are too few\."
+    ):
+        osp.crop(scene_file, target, box=(0, 0, 0, 1, 1))
+    with pytest.raises(osp.ConfigError, match=r"^sphere: must have at most 4 values, not 5\."):
+        osp.crop(scene_file, target, sphere=(0, 0, 0, 1, 1))
+    with pytest.raises(osp.ConfigError, match=r"^files: must have at least 1 value, not 0\."):
+        osp.export(scene_file, [])
