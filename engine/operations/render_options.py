@@ -182,7 +182,10 @@ class PictureOptions(Options):
     @model_validator(mode="after")
     def _cameras_fit(self) -> "PictureOptions":
         if self.mode == "views" and self.format == "mp4":
-            raise ValueError("views are images; choose the format png or exr (name a folder)")
+            raise ValueError(
+                "views of photographs are images: name a folder, or for a video a turntable or a path of "
+                "cameras"
+            )
         if self.mode != "views" and self.photographs is not None:
             raise ValueError("photographs are views; choose the mode views")
         for mode, name in (("path", "camera_path"), ("camera", "camera")):

@@ -304,3 +304,14 @@ def test_too_few_and_too_many_values_are_told_in_plain_words(scene_file: Path, t
         osp.crop(scene_file, target, sphere=(0, 0, 0, 1, 1))
     with pytest.raises(osp.ConfigError, match=r"^files: must have at least 1 value, not 0\."):
         osp.export(scene_file, [])
+
+
+def test_name_without_its_unit_is_refused_with_the_whole_name(scene_file: Path, tmp_path: Path) -> None:
+    with pytest.raises(osp.ConfigError, match="render has no option 'fov'; the nearest is fov_y_degrees"):
+        osp.render(scene_file, tmp_path / "a.png", **{"fov": 40})
+
+
+def test_one_size_alone_is_measured(in_folder: Path) -> None:
+    assert set(osp.evaluate("run", scales=2).scales) == {"1/2"}
+    with pytest.raises(osp.ConfigError, match="a video a turntable or a path of cameras"):
+        osp.render("run", "turn.mp4", frames=2)

@@ -259,7 +259,7 @@ def test_options_of_the_last_version_are_still_read():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"mode": "views"}, "choose the format png or exr"),
+        ({"mode": "views"}, "views of photographs are images"),
         ({"photographs": ["a.png"]}, "choose the mode views"),
         ({"mode": "path"}, "`camera_path` go together"),
         ({"mode": "path", "camera_path": "{"}, "is no JSON"),

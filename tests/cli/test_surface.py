@@ -144,7 +144,6 @@ def test_refusals_are_one_sentence(run, octasplat, tmp_path, monkeypatch, option
 @pytest.mark.parametrize(
     "bad",
     [
-        ("--box", "1", "2", "3", "4", "5", "six"),
         ("--fill-holes", "some"),
         ("--fill-holes", "-1"),
         ("--max-triangles", "5q"),

@@ -21,7 +21,7 @@ async def test_scene_job_invalid_options_are_refused_before_queueing(conninfo: s
             ({"kind": "import", "options": {"source": "a.ply"}, **on}, "#/source_id", "files_id alone"),
             (
                 {"kind": "import", "options": {"source": "b.ply"}, "files_id": files},
-                "#/options/file",
+                "#/options/source",
                 "there is no file 'b.ply'",
             ),
             ({"kind": "edit", "options": {}, **on}, "#/options/meshes", "required"),
