@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from pydantic import BeforeValidator, Field, ValidationError
+from pydantic import BeforeValidator, Field, ValidationError, field_validator
 
 from octasplat.engine.core.events import EventListener, ignore_events
 from octasplat.engine.operations.base import Operation, Options, Output, Request, Result, never_stop
@@ -23,7 +23,7 @@ from octasplat.engine.settings.fields import (
     Spelling,
     Unit,
 )
-from octasplat.engine.settings.nested_options import merge_options
+from octasplat.engine.settings.nested_options import merge_options, split_dotted_names
 from octasplat.engine.settings.refusals import InvalidSettingsError, refusals_from
 
 if TYPE_CHECKING:
@@ -80,7 +80,8 @@ class PlainReconstructOptions(RunSettings, Options):
         dict[str, Any], PartialOf("octasplat.engine.train.config:TrainConfig"), Spelling(hidden=True)
     ] = Field(
         default_factory=dict,
-        description="Settings of the training that are to be otherwise than the preset's.",
+        description="Settings of the training that are to be otherwise than the preset's, by names or in "
+        "sections.",
     )
     set: Annotated[
         tuple[str, ...],
@@ -93,6 +94,12 @@ class PlainReconstructOptions(RunSettings, Options):
         description="Any other setting, e.g. lr.quat=0.02 or test_every=4, values as JSON; octasplat "
         "config list shows them.",
     )
+
+    @field_validator("train")
+    @classmethod
+    def _in_sections(cls, train: dict[str, Any]) -> dict[str, Any]:
+        """Take names with dots, such as ``lr.quat``, as those of sections."""
+        return split_dotted_names(train)
 
     def config(self) -> "ReconstructionConfig":
         """Return the complete configuration that the options mean.

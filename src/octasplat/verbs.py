@@ -178,7 +178,8 @@ def reconstruct(
         max_gaussians: Most Gaussians; 0, the default, asks the photographs' pixels.
         sh_degree: Degree of the spherical harmonics of the colors, 0 to 3.
         seed: Seed of everything random. [default: 0]
-        train: Settings of the training that are to be otherwise than the preset's.
+        train: Settings of the training that are to be otherwise than the preset's, by names or in
+            sections.
         set: Any other setting, e.g. lr.quat=0.02 or test_every=4, values as JSON; octasplat config list
             shows them.
         fps: Of a video: so many frames of each second are taken, the sharpest ones. Default: 2.0.
@@ -342,7 +343,8 @@ def estimate(
         max_gaussians: Most Gaussians; 0, the default, asks the photographs' pixels.
         sh_degree: Degree of the spherical harmonics of the colors, 0 to 3.
         seed: Seed of everything random. [default: 0]
-        train: Settings of the training that are to be otherwise than the preset's.
+        train: Settings of the training that are to be otherwise than the preset's, by names or in
+            sections.
         set: Any other setting, e.g. lr.quat=0.02 or test_every=4, values as JSON; octasplat config list
             shows them.
         cores: Cores of the machine to reckon with; 0 takes those of this one. Default: 0.
@@ -500,7 +502,8 @@ def plan(
         max_gaussians: Most Gaussians; 0, the default, asks the photographs' pixels.
         sh_degree: Degree of the spherical harmonics of the colors, 0 to 3.
         seed: Seed of everything random. [default: 0]
-        train: Settings of the training that are to be otherwise than the preset's.
+        train: Settings of the training that are to be otherwise than the preset's, by names or in
+            sections.
         set: Any other setting, e.g. lr.quat=0.02 or test_every=4, values as JSON; octasplat config list
             shows them.
         cores: Cores of the machine to reckon with; 0 takes those of this one. Default: 0.

@@ -210,3 +210,14 @@ def test_edited_run_is_finished_and_not_measured(in_folder: Path) -> None:
     half = osp.Run("half")
     assert half.is_finished and half.psnr is None and repr(half) == "Run('half', not measured)"
     assert osp.evaluate(half).psnr == half.psnr
+
+
+def test_scene_of_an_unfinished_run_is_refused_with_what_to_do(photographs: Path, tmp_path: Path) -> None:
+    with pytest.raises(osp.CancelledError):
+        osp.reconstruct(photographs, tmp_path / "run", **RUN_OPTIONS, should_stop=lambda: True)
+    run = osp.Run(tmp_path / "run")
+    told = r"holds no scene\.ply yet; finish the run with"
+    with pytest.raises(osp.OctasplatError, match=told):
+        _ = run.scene
+    with pytest.raises(osp.OctasplatError, match=told):
+        osp.crop(run, tmp_path / "a.ply", where="z < 0")

@@ -258,6 +258,11 @@ def test_settings_by_name_are_those_of_texts() -> None:
         ).config()
         for given in (texts, tuple(texts), by_name)
     ]
+    trains = [{"lr.quat": 0.25, "lr": {"mean": 0.5}}, {"lr": {"quat": 0.25, "mean": 0.5}}]
+    by_dots, by_sections = (
+        build_request(request, {"source": "photos", "output": "out", "train": train}) for train in trains
+    )
+    assert by_dots.config() == by_sections.config() and by_dots.requested() == by_sections.requested()
     assert configs[0] == configs[1] == configs[2]
     assert configs[0].train.lr.quat == 0.25 and configs[0].test_every == 4
     alone = explicit_values(request, {"source": "photos", "output": "out", "set": "lr.quat=0.25"})
@@ -313,5 +318,13 @@ def test_name_without_its_unit_is_refused_with_the_whole_name(scene_file: Path, 
 
 def test_one_size_alone_is_measured(in_folder: Path) -> None:
     assert set(osp.evaluate("run", scales=2).scales) == {"1/2"}
+
+
+def test_video_and_number_of_frames_mean_a_turntable_of_a_run(in_folder: Path) -> None:
+    size = {"width_px": 32, "height_px": 16}
+    assert osp.render("run", "turn.mp4", frames=2, **size).images == 2
+    assert osp.render("run", "turn", frames=3, **size).images == 3
+    assert osp.render("run", "one.png", look_at=(0, 0, 0), frames=1, **size).images == 1
+    assert osp.render("run", "views").images == 2
     with pytest.raises(osp.ConfigError, match="a video a turntable or a path of cameras"):
-        osp.render("run", "turn.mp4", frames=2)
+        osp.render("run", "turn.mp4", views="held-out")

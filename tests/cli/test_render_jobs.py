@@ -350,7 +350,8 @@ def test_options_without_effect_on_cameras_are_warned_of(run, octasplat, tmp_pat
     assert "(max_side) goes with views of photographs" in done.stderr and "(fps) goes with" in done.stderr
     done = octasplat("render", run.output, "--views", "held-out", "--fov", 20, "-o", tmp_path / "views")
     assert done.exit_code == 0 and "(fov_y_degrees) goes with" in done.stderr, done.output
-    done = octasplat("render", run.output, "--frames", 3, "--width", 32, "--height", 32, "-o", tmp_path / "a")
+    vain = ("--frames", 3, "--width", 32, "--height", 32)
+    done = octasplat("render", run.output, "--views", "held-out", *vain, "-o", tmp_path / "a")
     assert done.exit_code == 0, done.output
     for name in ("frames", "width_px", "height_px"):
         assert f"({name}) goes with a turntable" in done.stderr
