@@ -227,6 +227,11 @@ def test_sheared_run_says_what_is_lost(in_folder: Path) -> None:
     sheared[0, 1] = 0.5
     osp.transform("run", "sheared", matrix=sheared, progress=told.append)
     assert any(isinstance(event, Warned) and "mirrored, sheared or" in event.message for event in told)
+    osp.transform("run", "moved", matrix=np.diag([2.0, 2, 2, 1]))
+    with pytest.raises(
+        osp.OctasplatError, match=r"moved was moved, and its photographs .* stand where they st"
+    ):
+        osp.evaluate("moved")
     record = json.loads(Path("sheared/edits.json").read_text())[-1]
     assert record["matrix"] == sheared.tolist()[:4]
 
