@@ -263,7 +263,7 @@ def test_options_of_the_last_version_are_still_read():
         ({"photographs": ["a.png"]}, "choose the mode views"),
         ({"mode": "path"}, "`camera_path` go together"),
         ({"mode": "path", "camera_path": "{"}, "is no JSON"),
-        ({"mode": "path", "camera_path": {**PATH, "frames": []}}, "at least 1 value"),
+        ({"mode": "path", "camera_path": {**PATH, "frames": []}}, "at least 1 item"),
         ({"camera": [0, 0, 1]}, "`camera` go together"),
         ({"mode": "camera", "camera": [0, 0, float("nan")]}, "finite"),
         ({"mode": "camera", "camera": [0, 0, 1]}, "there is one image"),
