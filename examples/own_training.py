@@ -28,7 +28,7 @@ def striped_ball(count: int = 3000) -> osp.Scene:
 
 def train(target: osp.Scene, steps: int = 150, count: int = 1500) -> tuple[osp.Scene, list[float]]:
     """Return a scene that looks like ``target``, and the PSNR of a view that was held out, every 50 steps."""
-    held_out, *cameras = target.turntable(9, width=64, height=64)
+    held_out, *cameras = target.turntable(9, width_px=64, height_px=64)
     pictures = [torch.from_numpy(osp.render(target, camera).rgb.reshape(-1, 3)) for camera in cameras]
     right = torch.from_numpy(osp.render(target, held_out).rgb.reshape(-1, 3))
     random = np.random.default_rng(1)

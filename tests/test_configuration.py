@@ -66,7 +66,7 @@ def test_assignments_are_read_as_json_or_as_text() -> None:
         with pytest.raises(InvalidSettingsError) as caught:
             resolve_config(assignments=[wrong])
         assert [(refused.path, refused.code) for refused in caught.value.refusals] == [
-            (("assignments",), "assignment")
+            (("set",), "assignment")
         ]
 
 

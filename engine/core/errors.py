@@ -1,6 +1,7 @@
 """Exceptions for users: each message is one sentence that names the file and what to do."""
 
 import re
+from pathlib import Path
 from typing import Any, ClassVar
 
 
@@ -25,6 +26,20 @@ class DatasetError(OctasplatError):
     """The photographs, masks or the COLMAP model cannot be used."""
 
     error_type = "dataset_error"
+
+
+class DamagedImageError(DatasetError):
+    """A photograph or mask is no image, or ends before all of it was read.
+
+    Attributes:
+        path: the file.
+    """
+
+    error_type = "dataset_error"
+
+    def __init__(self, message: str, path: Path) -> None:
+        super().__init__(message)
+        self.path = path
 
 
 class ColmapCrashError(OctasplatError):

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from octasplat.engine.core.errors import DatasetError
+from octasplat.engine.core.errors import DamagedImageError, DatasetError
 from octasplat.engine.dataset.image_info import Storage
 from octasplat.engine.dataset.images import ValueScale, read_photo
 from octasplat.engine.dataset.model import DatasetModel, scene_extent
@@ -71,13 +71,17 @@ def find_duplicates(model: DatasetModel) -> Duplicates:
     """Return the views of a scene that show one picture.
 
     Raises:
-        DatasetError: a photograph that may be a duplicate cannot be read.
+        DatasetError: a file that may be a duplicate cannot be opened.
     """
     poses = _Poses(model)
     alike = _equal_files([view.image_path for view in model.views])
     pairs = [pair for group in alike for pair in itertools.combinations(group, 2)]
     equal = poses.near_pairs(np.array(pairs, np.int64).reshape(-1, 2), EQUAL_SHIFT, EQUAL_TURN_RAD)
-    groups = _merge_overlapping_groups(len(model.views), (*equal, *_near_pictures(model, poses, set(equal))))
+    try:
+        near = _near_pictures(model, poses, set(equal))
+    except DamagedImageError:
+        near = []  # all that are damaged are named when they are decoded
+    groups = _merge_overlapping_groups(len(model.views), (*equal, *near))
     return Duplicates(groups, len(set(groups) & set(_merge_overlapping_groups(len(model.views), equal))))
 
 

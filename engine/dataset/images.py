@@ -11,7 +11,7 @@ from jaxtyping import Float32, UInt8
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from octasplat.engine.core.color import linear_to_srgb
-from octasplat.engine.core.errors import DatasetError
+from octasplat.engine.core.errors import DamagedImageError
 from octasplat.engine.core.image_messages import image_message
 from octasplat.engine.core.portable_names import is_text
 from octasplat.engine.core.threads import limit_torch_threads
@@ -150,17 +150,17 @@ def open_image(path: Path) -> tuple[Any, Any]:
     """Open an image; return what reads it and its header.
 
     Raises:
-        DatasetError: the file is missing or not an image.
+        DamagedImageError: the file is missing or not an image.
     """
     if not is_text(path):
-        raise DatasetError(f"{path} cannot be read as an image: its path is no text; rename it.")
+        raise DamagedImageError(f"{path} cannot be read as an image: its path is no text; rename it.", path)
     # By default OpenImageIO multiplies alpha into the colors of formats that store them straight.
     wish = oiio.ImageSpec()
     wish.attribute("oiio:UnassociatedAlpha", 1)
     source = oiio.ImageInput.open(str(path), wish)
     if source is None:
         reason = _single_line_message(image_message(oiio), path)
-        raise DatasetError(f"{path} cannot be read as an image{reason}; replace the file.")
+        raise DamagedImageError(f"{path} cannot be read as an image{reason}; replace the file.", path)
     return source, source.spec()
 
 
@@ -168,15 +168,15 @@ def read_pixels(source: Any, path: Path, kind: str) -> Pixels:
     """Read all channels (height, width, channels) of an opened image, converted to ``kind``.
 
     Raises:
-        DatasetError: the file is damaged or cut short.
+        DamagedImageError: the file is damaged or cut short.
     """
     pixels = source.read_image(kind)
     message = image_message(source)
     source.close()
     # A JPEG that ends early is filled up with gray and only this message tells.
     if pixels is None or "premature end" in message.lower():
-        raise DatasetError(
-            f"{path} is damaged or cut short{_single_line_message(message, path)}; replace the file."
+        raise DamagedImageError(
+            f"{path} is damaged or cut short{_single_line_message(message, path)}; replace the file.", path
         )
     return np.asarray(pixels).reshape(pixels.shape[0], pixels.shape[1], -1)
 

@@ -22,8 +22,14 @@ import numpy as np
 from jaxtyping import Int64
 
 from octasplat.engine.core import versions
-from octasplat.engine.core.errors import DatasetError, DiskFullError, OutputError
+from octasplat.engine.core.errors import DamagedImageError, DatasetError, DiskFullError, OutputError
 from octasplat.engine.core.writing import atomic_replace, write_json
+from octasplat.engine.dataset.damaged_images import (
+    collect_results,
+    decoding_workers,
+    find_damaged,
+    refuse_damaged,
+)
 from octasplat.engine.dataset.image_info import ImageInfo, Storage
 from octasplat.engine.dataset.images import ValueScale, read_photo
 from octasplat.engine.dataset.mapped_array import MappedArray
@@ -34,9 +40,6 @@ from octasplat.engine.dataset.views_file import FileDigests
 
 CACHE_VERSION = 4
 """Raised whenever the contents of the cache files change for the same photographs."""
-
-DECODING_BYTES = 2 << 30
-"""Memory that decoding threads may take together; one thread always runs."""
 
 Progress = Callable[[int, int], None]
 
@@ -328,25 +331,24 @@ def _decode_all(
             scale=known.get(info.storage),
         )
 
-    # Bytes per pixel: as stored, as float32, and a copy of either while channels are rearranged.
-    largest = max(36 * info.width_px * info.height_px for info in model.image_infos)
-    workers = min(threads if threads > 0 else os.cpu_count() or 1, max(1, DECODING_BYTES // largest))
-    summaries: list[_ViewSummary] = []
-    with ThreadPoolExecutor(workers) as pool:
-        photographs = [
-            (view.image_path, info) for view, info in zip(model.views, model.image_infos, strict=True)
-        ]
+    count = len(model.views)
+    photographs = [(view.image_path, info) for view, info in zip(model.views, model.image_infos, strict=True)]
+    with ThreadPoolExecutor(decoding_workers(threads, model.image_infos)) as pool:
         if scales is None:
-            known, warnings = find_value_scales(photographs, pool.map)
-        futures = [pool.submit(decode, index) for index in range(len(model.views))]
+            try:
+                known, warnings = find_value_scales(photographs, pool.map)
+            except DamagedImageError:
+                refuse_damaged(find_damaged(photographs, threads=threads), model.root)
+                raise
+        futures = [pool.submit(decode, index) for index in range(count)]
         try:
-            for future in futures:
-                summaries.append(future.result())
-                if progress is not None:
-                    progress(len(summaries), len(futures))
+            summaries, faults = collect_results(
+                futures, lambda done: None if progress is None else progress(done, count)
+            )
         finally:
             # After an error the other photographs need not be decoded.
             pool.shutdown(cancel_futures=True)
+    refuse_damaged(faults, model.root)
     return summaries, known, list(warnings)
 
 

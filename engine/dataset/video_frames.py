@@ -2,11 +2,8 @@
 
 import json
 import math
-import os
-import shutil
 import subprocess
 import tempfile
-import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +14,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from octasplat.engine.core.errors import DatasetError, OutputError
+from octasplat.engine.core.partial_folders import partial_folder
 from octasplat.engine.core.scene_layout import VIDEO_SUFFIXES
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset.image_sizes import ImageSizes
@@ -68,21 +66,18 @@ def write_frames(video: Path, folder: Path, frames_per_second: float, on_step: O
         raise OutputError(
             f"{folder} holds something else than frames of {video.name} at that rate; remove or rename it."
         )
-    # A name of its own, as another process may write frames of the video to the same folder.
-    partial = folder.with_name(f".{folder.name}.{os.getpid()}.{uuid.uuid4().hex[:8]}.partial")
     try:
-        (partial / "images").mkdir(parents=True)
-        count = _write_sharpest(video, partial / "images", frames_per_second, on_step)
-        write_json(partial / RECORD_FILE, record)
-        try:
-            partial.rename(folder)
-        except OSError:
-            if _read_record(folder) != record:  # another process was not first with the same frames
-                raise
+        with partial_folder(folder) as partial:
+            (partial / "images").mkdir()
+            count = _write_sharpest(video, partial / "images", frames_per_second, on_step)
+            write_json(partial / RECORD_FILE, record)
+            try:
+                partial.rename(folder)
+            except OSError:
+                if _read_record(folder) != record:  # another process was not first with the same frames
+                    raise
     except OSError as error:
         raise OutputError(f"{folder} cannot be written ({error.strerror or error}).") from None
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     return count
 
 

@@ -1,7 +1,6 @@
 """Folders of finished runs with a changed scene, without the measurements of the original."""
 
 import json
-import os
 import shutil
 from collections.abc import Mapping
 from dataclasses import replace
@@ -12,6 +11,7 @@ from jaxtyping import Float
 
 from octasplat.engine.core.errors import OutputError
 from octasplat.engine.core.georeference import GEOREFERENCE_FILE, is_similarity, write_georeference
+from octasplat.engine.core.partial_folders import partial_folder
 from octasplat.engine.core.writing import report_disk_full, write_json
 from octasplat.engine.edit.run_transform import write_transformed_run_files
 from octasplat.engine.files import read_metadata
@@ -21,6 +21,7 @@ from octasplat.engine.gaussians.scene_metadata import SceneMetadata
 from octasplat.engine.runs.run_folder import (
     BACKGROUND,
     CONFIG,
+    EDITS,
     ENVIRONMENT_EXR,
     ENVIRONMENT_HDR,
     EVENTS,
@@ -31,8 +32,6 @@ from octasplat.engine.runs.run_folder import (
     VIEWS,
 )
 
-EDITS_FILE = "edits.json"
-"""What was changed since the training, first to last."""
 _COPIED_FILES = (CONFIG, EVENTS, HELD_OUT, VIEWS, ENVIRONMENT_HDR, ENVIRONMENT_EXR, BACKGROUND)
 """What is as true of the scene after it was changed where it stands."""
 _MEASURED = "training_views"
@@ -80,11 +79,9 @@ def write_edited_run(
     """
     check_new_run(target)
     metadata = facts or read_metadata(source)
-    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
     messages: tuple[str, ...] = ()
     try:
-        with report_disk_full(target):
-            partial.mkdir(parents=True)
+        with report_disk_full(target), partial_folder(target) as partial:
             if matrix is None:
                 _copy(source, partial)
             elif is_similarity(matrix):
@@ -97,12 +94,10 @@ def write_edited_run(
             if metadata.georeference is not None:
                 write_georeference(partial / GEOREFERENCE_FILE, metadata.georeference)
             write_gaussian_ply(gaussians, partial / SCENE, facts=replace(metadata, georeference=None))
-            write_json(partial / EDITS_FILE, [*_read_edits(source), dict(edit_record)])
+            write_json(partial / EDITS, [*_read_edits(source), dict(edit_record)])
             partial.replace(target)
     except OSError as error:
         raise OutputError(f"{target} cannot be written ({error.strerror or error}).") from None
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     return messages
 
 
@@ -123,10 +118,10 @@ def _copy(source: Path, target: Path) -> None:
 
 
 def _read_edits(source: Path) -> list[object]:
-    if not (source / EDITS_FILE).exists():
+    if not (source / EDITS).exists():
         return []
     try:
-        found = json.loads((source / EDITS_FILE).read_text(encoding="utf-8"))
+        found = json.loads((source / EDITS).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise OutputError(f"{source / EDITS_FILE} cannot be read ({error}); delete it.") from None
+        raise OutputError(f"{source / EDITS} cannot be read ({error}); delete it.") from None
     return found if isinstance(found, list) else [found]

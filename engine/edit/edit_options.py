@@ -41,7 +41,7 @@ class Selection(BaseModel):
         description="Comparisons joined by and, or, not that hold for them, of x, y, z, opacity and channels "
         "such as metallic, roughness and albedo.r: 'metallic > 0.5 and z < 0'.",
     )
-    box: Annotated[BoxCorners | None, Spelling(metavar="X0 Y0 Z0 X1 Y1 Z1")] = Field(
+    box: Annotated[BoxCorners | None, Unit("scene units"), Spelling(metavar="X0 Y0 Z0 X1 Y1 Z1")] = Field(
         None,
         description="Two corners of a box that their centres lie in, smallest coordinates first.",
     )
@@ -159,7 +159,7 @@ class MaterialChange(BaseModel):
         description="Values to set: albedo=R,G,B (linear, 0 to 1), albedo=#rrggbb (display), "
         "metallic=0..1 or roughness=0..1.",
     )
-    scale: Annotated[
+    multiply: Annotated[
         MaterialFactors, BeforeValidator(read_assignments), Spelling(metavar="NAME=FACTOR", repeated=True)
     ] = Field(
         MaterialFactors(),
@@ -168,12 +168,13 @@ class MaterialChange(BaseModel):
 
     @model_validator(mode="after")
     def _says_something_once(self) -> "MaterialChange":
-        both = self.set.set_values().keys() & self.scale.set_values().keys()
+        both = self.set.set_values().keys() & self.multiply.set_values().keys()
         if both:
-            raise ValueError(f"{sorted(both)[0]} is set and scaled; choose one")
-        if not self.set.set_values() and not self.scale.set_values():
+            raise ValueError(f"{sorted(both)[0]} is set and multiplied; choose one")
+        if not self.set.set_values() and not self.multiply.set_values():
             raise ValueError(
-                "Say what to change: nothing is changed unless albedo, metallic or roughness is set or scaled"
+                "Say what to change: nothing is changed unless albedo, metallic or roughness is set or "
+                "multiplied"
             )
         return self
 
@@ -226,12 +227,12 @@ class CleanupOptions(BaseModel):
     min_opacity: float = Field(
         0.01, ge=0.0, lt=1.0, description="Remove fainter ones; below 0.01 they cannot be seen."
     )
-    min_scale: Annotated[float, Unit("world")] = Field(
+    min_scale: Annotated[float, Unit("scene units")] = Field(
         0.0,
         ge=0.0,
         description="Remove those whose larger standard deviation is smaller, in the scene's units.",
     )
-    max_scale: Annotated[float | None, Unit("world")] = Field(
+    max_scale: Annotated[float | None, Unit("scene units")] = Field(
         None,
         gt=0.0,
         description="Remove those whose larger standard deviation is larger, in the scene's units.",

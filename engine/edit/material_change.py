@@ -23,7 +23,7 @@ def with_materials(
     gaussians: FlatGaussians, chosen: Bool[np.ndarray, " n"], change: MaterialChange
 ) -> FlatGaussians:
     """Return the scene with the materials of the selected Gaussians changed; other arrays are shared."""
-    values, factors = change.set.set_values(), change.scale.set_values()
+    values, factors = change.set.set_values(), change.multiply.set_values()
     changed = {name: gaussians.channels[name].copy() for name in (*values, *factors)}
     for name, value in values.items():
         changed[name][chosen] = value

@@ -19,6 +19,8 @@ from octasplat.engine.gaussians.scene_metadata import UNKNOWN_METADATA, SceneMet
 from octasplat.engine.geometry.imported_mesh import ImportedMesh
 
 FOLDER_FILES = ("scene.ply", "meta.json")
+_RUN_FILE = "config.json"
+"""What the folder of a run has from its beginning."""
 """What a folder is read by: the scene of a run, or the description of an unpacked SOG."""
 
 
@@ -104,4 +106,8 @@ def _scene_file(path: Path) -> Path:
     for name in FOLDER_FILES:
         if (path / name).exists():
             return path / name
+    if (path / _RUN_FILE).exists():
+        raise SceneFileError(
+            f"{path}: holds no {FOLDER_FILES[0]} yet; finish the run with: octasplat reconstruct --resume."
+        )
     raise SceneFileError(f"{path}: is a folder without a scene; it should hold {' or '.join(FOLDER_FILES)}.")

@@ -18,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.core.image_messages import image_message
+from octasplat.engine.core.partial_folders import partial_folder
 from octasplat.engine.core.writing import atomic_replace
 from octasplat.engine.files.channel_columns import ChannelChoice
 from octasplat.engine.files.encodings import SQRT_HALF, from_smallest_three, logits_from_bytes
@@ -294,13 +295,9 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
         OSError: the file cannot be written.
     """
     scene = select_for_export(gaussians, path, options)
-    path.parent.mkdir(parents=True, exist_ok=True)
     # beside the file, as the folder of the system may be in memory
-    with (
-        tempfile.TemporaryDirectory(prefix="octasplat-", dir=path.parent) as folder,
-        atomic_replace(path) as temporary,
-    ):
-        source, target = Path(folder) / "scene.ply", Path(folder) / "scene.sog"
+    with partial_folder(path) as folder, atomic_replace(path) as temporary:
+        source, target = folder / "scene.ply", folder / "scene.sog"
         write_gaussian_ply(scene, source)
         try:
             convert(source, target)

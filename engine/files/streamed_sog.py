@@ -7,13 +7,13 @@ the program splat-transform cuts and packs them, where that is.
 
 import json
 import re
-import tempfile
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32
 
 from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.core.partial_folders import partial_folder
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.folders_of_parts import former_folders, move_into_place
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
@@ -45,13 +45,12 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     scene = select_for_export(gaussians, path, options)
     former = former_folders(path, _chunk_names, _are_of_a_chunk)
     extent_world = max(map(_spread, scene.means_world.T)) / CHUNKS_ACROSS
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix="octasplat-", dir=path.parent) as folder:
+    with partial_folder(path) as folder:
         levels: list[Path] = []
         for level in iterate_levels(scene, MIN_LEVEL_COUNT, path.parent, MAX_LEVELS):
-            levels.append(Path(folder) / f"level_{len(levels)}.ply")
+            levels.append(folder / f"level_{len(levels)}.ply")
             write_gaussian_ply(level, levels[-1])
-        index = Path(folder) / "packed" / INDEX_FILE
+        index = folder / "packed" / INDEX_FILE
         index.parent.mkdir()
         try:
             convert_levels(levels, index, chunk_extent_world=extent_world)

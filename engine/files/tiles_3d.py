@@ -6,7 +6,6 @@ of its depth. Tiles are z up, their contents y up; the transform of the root put
 """
 
 import json
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from jaxtyping import Float64, Int
 
 from octasplat.engine.core.earth_frame import geocentric_from_metres
 from octasplat.engine.core.local_origin import is_set
+from octasplat.engine.core.partial_folders import partial_folder
 from octasplat.engine.core.writing import write_text
 from octasplat.engine.files.compressed_khr_glb import EXTENSIONS, write_compressed_glb
 from octasplat.engine.files.export_options import ExportOptions
@@ -53,9 +53,8 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     former = former_folders(path, _content_folders, _are_tiles)
     depth = len(level_counts(len(scene), FEWEST_IN_ROOT)) - 1
     cells = halve_points(scene.means_world, depth)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix="octasplat-", dir=path.parent) as folder:
-        index = Path(folder) / INDEX_FILE
+    with partial_folder(path) as folder:
+        index = folder / INDEX_FILE
         (index.parent / CONTENT_FOLDER).mkdir()
         contents: dict[tuple[int, int], TileContent] = {}
         for finer, level in enumerate(iterate_levels(scene, FEWEST_IN_ROOT, path.parent)):

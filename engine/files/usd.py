@@ -6,7 +6,6 @@ usd-core (the extra ``usd``).
 """
 
 import shutil
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -19,6 +18,7 @@ from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.core.file_arrays import new_array
 from octasplat.engine.core.local_origin import is_set
+from octasplat.engine.core.partial_folders import partial_folder
 from octasplat.engine.core.writing import atomic_replace
 from octasplat.engine.files.encodings import half_turn_points, half_turn_quats, half_turn_sh, unit_quats
 from octasplat.engine.files.export_options import ExportOptions
@@ -55,13 +55,8 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     check_scales(scene, path)
     pxr = _import_usd(path)
     suffix = ".usdc" if path.suffix.lower() in (".usdz", ".usd") else path.suffix.lower()
-    place = path.parent
-    place.mkdir(parents=True, exist_ok=True)
-    with (
-        tempfile.TemporaryDirectory(prefix="octasplat-", dir=place) as folder,
-        atomic_replace(path) as temporary,
-    ):
-        layer = Path(folder) / f"scene{suffix}"
+    with partial_folder(path) as folder, atomic_replace(path) as temporary:
+        layer = folder / f"scene{suffix}"
         _write_stage(pxr, scene, layer, options.facts)
         if path.suffix.lower() == ".usdz":
             if (size := layer.stat().st_size) > MAX_BYTES:
@@ -69,7 +64,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
                     f"{path}: not written; {len(scene):,} Gaussians need {size:,} bytes, and a USDZ of ours "
                     f"holds at most {MAX_BYTES:,}. Name a .usdc, or leave faint ones out with min_opacity."
                 )
-            package = Path(folder) / "scene.usdz"
+            package = folder / "scene.usdz"
             if not pxr["UsdUtils"].CreateNewUsdzPackage(pxr["Sdf"].AssetPath(str(layer)), str(package)):
                 raise SceneFileError(f"{path}: not written; usd-core could not make the package.")
             layer = package

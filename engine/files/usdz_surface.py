@@ -6,7 +6,6 @@ surface is lit. Needs the package usd-core (the extra ``usd``).
 """
 
 import io
-import tempfile
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,6 +18,7 @@ from jaxtyping import Float64, UInt8
 from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.core.local_origin import is_set
+from octasplat.engine.core.partial_folders import partial_folder
 from octasplat.engine.core.writing import atomic_replace
 from octasplat.engine.files.glb_container import light_rotation
 from octasplat.engine.files.glb_place import HALF_TURN_ABOUT_X, rotation_of
@@ -65,7 +65,7 @@ def write_surface(
         if mesh.materials is not None:
             textures["materials.png"] = mesh.materials.occlusion_roughness_metallic
             textures["normals.png"] = mesh.materials.normals
-    entries = [("surface.usdc", _layer(pxr, mesh, turn_xyzw))]
+    entries = [("surface.usdc", _layer(pxr, mesh, path, turn_xyzw))]
     entries += [(name, png_bytes(pixels)) for name, pixels in textures.items()]
     needed = sum(len(data) for _, data in entries)
     if needed > MAX_BYTES:
@@ -92,11 +92,13 @@ def _package(entries: Sequence[tuple[str, bytes]]) -> bytes:
     return buffer.getvalue()
 
 
-def _layer(pxr: dict[str, ModuleType], mesh: TriangleMesh, turn_xyzw: Sequence[float] | None) -> bytes:
-    """Return the binary layer."""
+def _layer(
+    pxr: dict[str, ModuleType], mesh: TriangleMesh, path: Path, turn_xyzw: Sequence[float] | None
+) -> bytes:
+    """Return the binary layer, which is written beside ``path`` first."""
     geom = pxr["UsdGeom"]
-    with tempfile.TemporaryDirectory(prefix="octasplat-") as folder:
-        file = Path(folder) / "surface.usdc"
+    with partial_folder(path) as folder:
+        file = folder / "surface.usdc"
         stage = pxr["Usd"].Stage.CreateNew(str(file))
         geom.SetStageUpAxis(stage, geom.Tokens.y)
         root = geom.Xform.Define(stage, ROOT)

@@ -143,6 +143,15 @@ def read_matrix(path: Path) -> Float64[np.ndarray, "4 4"]:
         raise ConfigError(f"{path}: holds no matrix ({error}).") from error
     if len(values) not in (12, 16):
         raise ConfigError(f"{path}: holds {len(values)} numbers; a matrix has 12 or 16, row by row.")
+    return whole_matrix(values.reshape(-1, 4))
+
+
+def whole_matrix(rows: Float[np.ndarray, "r 4"]) -> Float64[np.ndarray, "4 4"]:
+    """Return the 4 x 4 matrix of three or four rows.
+
+    >>> bool((whole_matrix(np.eye(4)[:3]) == np.eye(4)).all())
+    True
+    """
     matrix = np.eye(4)
-    matrix[: len(values) // 4] = values.reshape(-1, 4)
+    matrix[: len(rows)] = rows
     return matrix

@@ -61,7 +61,7 @@ def require_materials(gaussians: FlatGaussians, path: Path) -> None:
     if not has_materials(gaussians):
         raise ConfigError(
             f"{path} has no materials (the channels {', '.join(MATERIAL_WIDTHS)}); "
-            "train it with: octasplat reconstruct SCENE -o OUT --materials."
+            "train it with: octasplat reconstruct PHOTOS -o OUT --materials."
         )
 
 

@@ -54,7 +54,7 @@ class DeformOptions(Options):
         "nearest",
         description="nearest: follow the triangles close by; mvc: mean-value coordinates of a closed cage.",
     )
-    reach: Annotated[_Length | None, Spelling(metavar="LENGTH"), Unit("world")] = Field(
+    reach: Annotated[_Length | None, Spelling(metavar="LENGTH"), Unit("scene units")] = Field(
         None,
         ge=0.0,
         description="Follow fully up to this distance from the mesh, and not at all beyond twice of it; inf "

@@ -29,16 +29,16 @@ class EstimateOptions(PlainReconstructOptions):
 
 
 class EstimateRequest(EstimateOptions, Request):
-    """Estimate the time, memory and disk that the reconstruction of SCENE takes, within a factor of two.
+    """Estimate the time, memory and disk that the reconstruction of PHOTOS takes, within a factor of two.
 
     The options are those of reconstruct; for blocks octasplat plan has them. Photographs are not decoded:
     their sizes are enough.
     """
 
-    source: Annotated[Path, Positional("SCENE"), ReadPath()] = Field(
+    source: Annotated[Path, Positional("PHOTOS"), ReadPath()] = Field(
         description="The folder of the photographs, or a video, of which no frames are written."
     )
-    frames_per_second: Annotated[float, Spelling(metavar="N")] = Field(
+    fps: Annotated[float, Unit("images/s"), Spelling(metavar="N")] = Field(
         2.0, gt=0, le=120, description="Of a video: so many frames of each second would be taken."
     )
 
@@ -95,7 +95,7 @@ def run(
 
     config, cores = request.config(), request.cores or threads  # 0 of both: the cores of this machine
     if is_video(request.source):
-        frames = planned_frames(request.source, request.frames_per_second)
+        frames = planned_frames(request.source, request.fps)
         # a video has no model: poses are found
         estimate = estimate_photographs([frames], config.with_poses_decided(False), cores)
         return EstimateResult(photographs=(frames,), **estimate.model_dump())

@@ -17,7 +17,7 @@ _METRICS, _REPORT, _PICTURES = "metrics.json", "report.html", ("renders", "layer
 
 def _read_scales(value: object) -> object:
     """Return the numbers of a text such as ``2,4,8``, or of several, in order and each once."""
-    parts = value.split(",") if isinstance(value, str) else value
+    parts = value.split(",") if isinstance(value, str) else (value,) if isinstance(value, int) else value
     if not isinstance(parts, list | tuple | set):
         return value
     try:

@@ -23,7 +23,7 @@ def read_channels(value: object) -> object:
 class ImportOptions(Options):
     """Options of which file to read, and how."""
 
-    file: Annotated[InputFile, Positional("IN")] = Field(
+    source: Annotated[InputFile, Positional("IN")] = Field(
         description="The scene to read, a file of any known format."
     )
     format: Annotated[str | None, Spelling(metavar="NAME")] = Field(
@@ -114,7 +114,7 @@ def run(
     from octasplat.engine.files.gaussian_ply import write_gaussian_ply
     from octasplat.engine.operations.scene_io import check_scenes, report_dropped_on_import
 
-    source: Path = request.file
+    source: Path = request.source
     check_scenes("import", [request.output], [source], overwrite=request.overwrite)
     gaussians, report = read_scene(
         source,

@@ -1,8 +1,8 @@
 """``merge``: several scenes as one."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
@@ -17,7 +17,7 @@ from octasplat.engine.operations.base import (
     options_of,
     stop_if,
 )
-from octasplat.engine.settings.fields import InputFile, Positional
+from octasplat.engine.settings.fields import AlsoSequence, InputFile, Positional, Source
 
 
 class MergeOptions(Options):
@@ -45,6 +45,24 @@ class MergeRequest(MergeOptions, SceneRequest):
 
     Named channels that only some of the scenes have are 0 for the Gaussians of the others.
     """
+
+    source: Annotated[Source, AlsoSequence()] = Field(
+        description="The first scene: a file of any format, or the folder of a run. Python also takes a "
+        "list of all scenes here."
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _first_of_several(cls, given: Any) -> Any:
+        """Take a list in the place of the first scene for all scenes, in order."""
+        if not isinstance(given, Mapping) or not isinstance(given.get("source"), list | tuple):
+            return given
+        several, others = given["source"], given.get("scenes") or ()
+        if not several:
+            raise ValueError("Name at least two scenes; the list of them is empty")
+        first, *rest = several
+        further = others if isinstance(others, list | tuple) else (others,)
+        return {**given, "source": first, "scenes": (*rest, *further)}
 
 
 class MergeResult(ScenesWritten):

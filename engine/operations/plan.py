@@ -27,14 +27,14 @@ class PlanOptions(EstimateOptions, BlockOptions):
 
 
 class PlanRequest(PlanOptions, WritingRequest):
-    """Plan the blocks of SCENE: how many, how many photographs show each, and the time and memory it takes.
+    """Plan the blocks of PHOTOS: how many, how many photographs show each, and the time and memory it takes.
 
     The options are those of reconstruct; without --blocks it is --blocks auto. The plan comes from the sparse
     points of the model in seconds; the run itself cuts by its coarse scene, so that its blocks are alike, not
     the same. Figures are right within a factor of two.
     """
 
-    source: Annotated[Path, Positional("SCENE"), ReadPath()] = Field(
+    source: Annotated[Path, Positional("PHOTOS"), ReadPath()] = Field(
         description="The folder of the photographs and their model."
     )
     picture: Annotated[Path | None, Spelling(metavar="FILE.png")] = Field(

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from pydantic import Field, ValidationError
+from pydantic import BeforeValidator, Field, ValidationError, field_validator
 
 from octasplat.engine.core.events import EventListener, ignore_events
 from octasplat.engine.operations.base import Operation, Options, Output, Request, Result, never_stop
@@ -21,8 +21,9 @@ from octasplat.engine.settings.fields import (
     ReadPath,
     Shortcut,
     Spelling,
+    Unit,
 )
-from octasplat.engine.settings.nested_options import merge_options
+from octasplat.engine.settings.nested_options import merge_options, split_dotted_names
 from octasplat.engine.settings.refusals import InvalidSettingsError, refusals_from
 
 if TYPE_CHECKING:
@@ -30,6 +31,20 @@ if TYPE_CHECKING:
     from octasplat.engine.runs.config import ReconstructionConfig
 
 _CONFIG, _METRICS, _REPORT, _SCENE = "config.json", "metrics.json", "report.html", "scene.ply"
+
+
+def _read_settings(value: object) -> object:
+    """Return settings by name as texts such as ``lr.quat=0.02``; one text alone as the only one."""
+    if isinstance(value, str):
+        return (value,)
+    if isinstance(value, Mapping):
+        return tuple(f"{name}={json.dumps(setting, default=_as_json)}" for name, setting in value.items())
+    return value
+
+
+def _as_json(value: Any) -> Any:
+    """Return what JSON has for a value of Python: numbers of an array, or the text of a path."""
+    return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
 class PlainReconstructOptions(RunSettings, Options):
@@ -65,14 +80,26 @@ class PlainReconstructOptions(RunSettings, Options):
         dict[str, Any], PartialOf("octasplat.engine.train.config:TrainConfig"), Spelling(hidden=True)
     ] = Field(
         default_factory=dict,
-        description="Settings of the training that are to be otherwise than the preset's.",
+        description="Settings of the training that are to be otherwise than the preset's, by names or in "
+        "sections.",
     )
-    assignments: Annotated[tuple[str, ...], Spelling(("--set",), metavar="NAME=VALUE"), ADVANCED] = Field(
+    set: Annotated[
+        tuple[str, ...],
+        BeforeValidator(_read_settings, json_schema_input_type=tuple[str, ...] | dict[str, Any] | str),
+        Spelling(metavar="NAME=VALUE", repeated=True),
+        ADVANCED,
+    ] = Field(
         (),
         max_length=1000,
         description="Any other setting, e.g. lr.quat=0.02 or test_every=4, values as JSON; octasplat "
         "config list shows them.",
     )
+
+    @field_validator("train")
+    @classmethod
+    def _in_sections(cls, train: dict[str, Any]) -> dict[str, Any]:
+        """Take names with dots, such as ``lr.quat``, as those of sections."""
+        return split_dotted_names(train)
 
     def config(self) -> "ReconstructionConfig":
         """Return the complete configuration that the options mean.
@@ -88,7 +115,7 @@ class PlainReconstructOptions(RunSettings, Options):
             materials=self.materials,
             settings=settings,
             train=self._nested_train_settings(),
-            assignments=self.assignments,
+            assignments=self.set,
         )
 
     def requested(self) -> dict[str, Any]:
@@ -103,7 +130,7 @@ class PlainReconstructOptions(RunSettings, Options):
             given,
             materials=self.materials if "materials" in self.model_fields_set else None,
             train=merge_options(self.train, self._shortcut_settings()),
-            assignments=self.assignments,
+            assignments=self.set,
         )
         return {**requested, "for_surface": True} if self.for_surface else requested
 
@@ -119,7 +146,7 @@ class PlainReconstructOptions(RunSettings, Options):
             {name: getattr(self, name) for name in RunSettings.model_fields if name in self.model_fields_set},
             materials=self.materials if "materials" in self.model_fields_set else None,
             train=self._nested_train_settings(),
-            assignments=self.assignments,
+            assignments=self.set,
         )
 
     def revised(self, before: Mapping[str, Any]) -> "ReconstructionConfig":
@@ -136,7 +163,7 @@ class PlainReconstructOptions(RunSettings, Options):
             materials=self.materials if "materials" in given else None,
             settings={name: getattr(self, name) for name in RunSettings.model_fields if name in given},
             train=self._nested_train_settings(),
-            assignments=self.assignments,
+            assignments=self.set,
         )
 
     def _nested_train_settings(self) -> dict[str, Any]:
@@ -164,19 +191,19 @@ class ReconstructOptions(PlainReconstructOptions, BlockOptions):
 
 
 class ReconstructRequest(ReconstructOptions, Request):
-    """Reconstruct SCENE, a folder with images/ and a COLMAP model in sparse/0, or with photographs alone.
+    """Reconstruct PHOTOS, a folder with images/ and a COLMAP model in sparse/0, or with photographs alone.
 
-    Where there is no model, COLMAP finds the poses of the photographs. SCENE may also be a video: its
+    Where there is no model, COLMAP finds the poses of the photographs. PHOTOS may also be a video: its
     sharpest frames become photographs, in a folder beside the output. The output folder gets scene.ply,
     meshes, metrics.json, report.html, renders of the held-out views and checkpoints. Ctrl-C stops after
     writing a checkpoint; the same command with --resume goes on.
     """
 
-    source: Annotated[Path, Positional("SCENE"), ReadPath()] = Field(
+    source: Annotated[Path, Positional("PHOTOS"), ReadPath()] = Field(
         description="The folder of the photographs, or a video."
     )
     output: Output = Field(description="Folder for the results.")
-    frames_per_second: Annotated[float, Spelling(metavar="N")] = Field(
+    fps: Annotated[float, Unit("images/s"), Spelling(metavar="N")] = Field(
         2.0,
         gt=0,
         le=120,
@@ -260,10 +287,10 @@ def _takes_own_settings(request: ReconstructRequest) -> bool:
     """Return whether a request goes on with a run by the run's own settings."""
     # with options the request's configuration counts, and is checked against the run's
     given = request.model_fields_set - {
-        *("source", "output", "resume", "exports", "frames_per_second", "blocks", "memory", "start_from")
+        *("source", "output", "resume", "exports", "fps", "blocks", "memory", "start_from")
     }  # fmt: skip
     # empty ones say nothing, whoever filled them in
-    given -= {name for name in ("train", "assignments") if not getattr(request, name)}
+    given -= {name for name in ("train", "set") if not getattr(request, name)}
     return request.resume and not given and (request.output / _CONFIG).exists()
 
 
@@ -289,7 +316,7 @@ def _take_frames(request: ReconstructRequest, folder: Path, progress: EventListe
     from octasplat.engine.dataset.video_frames import write_frames
 
     with counted_phase("frames", progress) as count:
-        written = write_frames(request.source, folder, request.frames_per_second, count)
+        written = write_frames(request.source, folder, request.fps, count)
     progress(Noted(f"{written} frames of {request.source.name} are in {folder}."))
 
 

@@ -51,7 +51,7 @@ class RelightOptions(PictureOptions):
     max_bounces: Annotated[int, Unit("surfaces")] = Field(
         6, ge=1, le=64, description="Path: most surfaces that a path of light meets."
     )
-    rotation_degrees: Annotated[Angle, Unit("degrees"), Spelling(("--rotate",), metavar="DEG")] = Field(
+    rotation_degrees: Annotated[Angle, Unit("degrees"), Spelling(("--rotation",), metavar="DEG")] = Field(
         0.0, description="Turn the light about the vertical by this angle in degrees."
     )
     clamp: Annotated[float | None, Unit("radiance"), Spelling(metavar="MOST")] = Field(

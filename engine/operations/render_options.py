@@ -25,6 +25,8 @@ Point = tuple[Coordinate, Coordinate, Coordinate]
 PhotographName = Annotated[str, Field(min_length=1, max_length=1000)]
 
 DEFAULT_FPS = 30.0
+_OF_TURNTABLES = ("frames", "seconds", "distance", "elevation_degrees", "look_at")
+"""Options that say what a turntable is like; with them a run is not shown in its photographs' views."""
 MAX_SIDE_PX = 16384
 UP_OF_RUN_UNUSED = (
     "The axis that points up (up) goes with a file; the photographs of a run say so themselves, and it is "
@@ -182,7 +184,10 @@ class PictureOptions(Options):
     @model_validator(mode="after")
     def _cameras_fit(self) -> "PictureOptions":
         if self.mode == "views" and self.format == "mp4":
-            raise ValueError("views are images; choose the format png or exr (name a folder)")
+            raise ValueError(
+                "views of photographs are images: name a folder, or for a video a turntable or a path of "
+                "cameras"
+            )
         if self.mode != "views" and self.photographs is not None:
             raise ValueError("photographs are views; choose the mode views")
         for mode, name in (("path", "camera_path"), ("camera", "camera")):
@@ -212,7 +217,8 @@ class PictureRequest(PictureOptions, WritingRequest):
     """A render with the scene to read and the place to write images.
 
     Where they are not given, the format is that of the output's name, and the mode that of the cameras that
-    are given: else the views of a run, or a turntable of a file.
+    are given; a video and options of a turntable alone mean one. Else it is the views of a run, or a
+    turntable of a file.
     """
 
     former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.DATASET
@@ -263,6 +269,9 @@ class PictureRequest(PictureOptions, WritingRequest):
             raise ValueError("choose one of views, a turntable, a camera path and a single camera")
         if found:
             return found.pop()
+        is_video = Path(given["output"]).suffix.lower() == ".mp4" or given.get("format") == "mp4"
+        if is_video or any(name in given for name in _OF_TURNTABLES):
+            return "turntable"
         # imported late: numba and scipy come with it
         from octasplat.engine.runs.run_folder import is_full_run
 

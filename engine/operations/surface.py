@@ -83,7 +83,7 @@ class SurfaceOptions(ExtractionOptions, Options):
 
     room: bool = Field(
         False,
-        description="What pictures of a room need, where nothing else is said: unbounded (not with bounds), "
+        description="What pictures of a room need, where nothing else is said: unbounded (not with a box), "
         "unseen solid, backdrop, refine_vertices, and finer voxels than a box has.",
     )
     max_triangles: Annotated[
@@ -112,8 +112,8 @@ class SurfaceOptions(ExtractionOptions, Options):
             return given
         given = renamed_settings.replace_former_names((cls,), given)
         room = dict(ROOM_DEFAULTS) if _is_on(given.get("room", False)) else {}
-        if given.get("bounds") is not None:
-            room.pop("unbounded", None)  # a box says that there are bounds
+        if given.get("box") is not None:
+            room.pop("unbounded", None)  # which a box contradicts
         if given.get("voxel") is not None:
             room.pop("resolution", None)
         materials = MATERIAL_DEFAULTS if _is_on(given.get("materials", False)) else {}
@@ -275,8 +275,8 @@ def run(
     surfaces = extract_levels(
         tracer,
         cameras,
-        # bounds are given in the user's coordinates
-        request.model_copy(update={"bounds": box_about(request.bounds, facts.origin_world)}),
+        # the box is given in the user's coordinates
+        request.model_copy(update={"box": box_about(request.box, facts.origin_world)}),
         tuple(request.levels.values()) or (None,),
         scratch=output.parent,
         light_frame=frame,

@@ -3,11 +3,11 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import Field, FiniteFloat, model_validator
+from pydantic import Field, FiniteFloat, WrapValidator, model_validator
 
 from octasplat.engine.core.events import EventListener, ignore_events
 from octasplat.engine.core.georeference import Georeference
@@ -26,15 +26,41 @@ from octasplat.engine.operations.base import (
 from octasplat.engine.settings.fields import InputFile, Spelling, Unit
 
 _Point = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+_Row = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
+_Rows = tuple[_Row, _Row, _Row] | tuple[_Row, _Row, _Row, _Row]
+
+
+def _checked_matrix(value: Any, handler: Callable[[Any], Any]) -> Any:
+    """Return a path as such, and numbers as rows; refuses what is no affine matrix, in one sentence."""
+    if value is None or isinstance(value, str | Path):
+        return handler(value)
+    try:
+        rows = np.array(value, np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(
+            "must be a 4 x 4 or 3 x 4 matrix of numbers, or the path of a text file with one"
+        ) from None
+    if rows.shape not in ((4, 4), (3, 4)):
+        shape = " x ".join(map(str, rows.shape)) or "a single number"
+        raise ValueError(
+            f"must be a 4 x 4 or 3 x 4 matrix, or the path of a text file with one; what is given is {shape}"
+        )
+    if not np.isfinite(rows).all():
+        raise ValueError("must have finite numbers only")
+    if len(rows) == 4 and not np.array_equal(rows[3], [0.0, 0.0, 0.0, 1.0]):
+        raise ValueError("must have the last row 0 0 0 1: it maps columns (x, y, z, 1) to new ones")
+    return handler(tuple(map(tuple, rows.tolist())))
 
 
 class TransformOptions(Options):
     """The transforms, applied in this order: matrix, up, scale, rotate (repeatable), translate."""
 
-    matrix: Annotated[InputFile | None, Spelling(metavar="FILE")] = Field(
-        None,
-        description="A text file with an affine 4 x 4 or 3 x 4 matrix, row by row, that maps old points to "
-        "new ones.",
+    matrix: Annotated[InputFile | _Rows | None, WrapValidator(_checked_matrix), Spelling(metavar="FILE")] = (
+        Field(
+            None,
+            description="An affine 4 x 4 or 3 x 4 matrix that maps old points to new ones, row by row: a "
+            "text file or, in Python and JSON, its rows.",
+        )
     )
     up: Annotated[tuple[Axis, Axis] | None, Spelling(metavar="OLD NEW")] = Field(
         None,
@@ -50,8 +76,8 @@ class TransformOptions(Options):
         max_length=100,
         description="Turn about an axis, counter-clockwise seen from its tip; may be repeated.",
     )
-    translate: Annotated[_Point | None, Unit("world")] = Field(None, description="Move.")
-    about: Annotated[_Point, Unit("world")] = Field(
+    translate: Annotated[_Point | None, Unit("scene units")] = Field(None, description="Move.")
+    about: Annotated[_Point, Unit("scene units")] = Field(
         (0.0, 0.0, 0.0), description="The point that up, scale and rotate leave where it is."
     )
 
@@ -80,7 +106,12 @@ class TransformOptions(Options):
         # about the point: moved to the origin, turned, moved back
         combined = affine.conjugate_by_point(turns, np.array(self.about))
         if self.matrix is not None:
-            combined = combined @ affine.read_matrix(self.matrix)
+            matrix = self.matrix
+            combined = combined @ (
+                affine.read_matrix(matrix)
+                if isinstance(matrix, Path)
+                else affine.whole_matrix(np.array(matrix, np.float64))
+            )
         if self.translate is not None:
             combined = affine.translation(np.array(self.translate)) @ combined
         return combined
@@ -125,7 +156,8 @@ def run(
     from octasplat.engine.operations import scene_io
 
     source: Path = request.source
-    scene_io.check_edited_output("transform", request, request.output, [request.matrix])
+    read = [request.matrix] if isinstance(request.matrix, Path) else []
+    scene_io.check_edited_output("transform", request, request.output, read)
     matrix = request.world_map()
     scene, facts = scene_io.open_scene(source, progress), read_metadata(source)
     # of a scene far from the world's origin positions need another local one

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float64
@@ -73,16 +74,13 @@ class PinholeCamera:
         array([ 0.,  0., -4.])
         """
         pose = _checked_pose(world_from_cam)
-        if not (width_px >= 1 and height_px >= 1):
-            raise ConfigError(
-                f"An image of {width_px} x {height_px} pixels has none; both must be at least 1."
-            )
+        _check_size(width_px, height_px)
         if not (fy_px > 0 and (fx_px is None or fx_px > 0)):
             raise ConfigError("A focal length must be above 0 px.")
         rotation = pose[:3, :3].T
         return cls(
-            width_px=width_px,
-            height_px=height_px,
+            width_px=int(width_px),
+            height_px=int(height_px),
             fx_px=fy_px if fx_px is None else fx_px,
             fy_px=fy_px,
             cx_px=width_px / 2 if cx_px is None else cx_px,
@@ -175,14 +173,22 @@ def _checked_pose(world_from_cam: ArrayLike) -> Float64[np.ndarray, "r 4"]:
     return pose
 
 
-def check_lens(width_px: int, height_px: int, fov_y_degrees: float) -> None:
+def _check_size(width_px: Any, height_px: Any) -> None:
+    """Refuse what is no size of an image, whatever it is."""
+    for name, side in (("width_px", width_px), ("height_px", height_px)):
+        if not isinstance(side, int | np.integer):
+            raise ConfigError(f"{name}: must be a whole number of pixels (it is {side!r}).")
+    if min(width_px, height_px) < 1:
+        raise ConfigError(f"An image of {width_px} x {height_px} pixels has none; both must be at least 1.")
+
+
+def check_lens(width_px: Any, height_px: Any, fov_y_degrees: float) -> None:
     """Refuse what is no size of an image or no field of view of a pinhole.
 
     Raises:
-        ConfigError: the image has no pixels, or the angle is not between 0 and 180 degrees.
+        ConfigError: the image has no pixels or parts of them, or the angle is not between 0 and 180 degrees.
     """
-    if min(width_px, height_px) < 1:
-        raise ConfigError(f"An image of {width_px} x {height_px} pixels has none; both must be at least 1.")
+    _check_size(width_px, height_px)
     if not 0 < fov_y_degrees < 180:
         raise ConfigError(f"A field of view lies between 0 and 180 degrees; it was given {fov_y_degrees:g}.")
 

@@ -297,7 +297,7 @@ def _read_assignment(assignment: str) -> tuple[list[str], Any]:
     name, equals, text = (part.strip() for part in assignment.partition("="))
     if not equals or not name:
         sentence = f"{assignment}: write an assignment as name=value, e.g. lr.mean=2e-4."
-        raise InvalidSettingsError([Refusal(("assignments",), "assignment", sentence)])
+        raise InvalidSettingsError([Refusal(("set",), "assignment", sentence)])
     try:
         value = json.loads(text)
     except ValueError:

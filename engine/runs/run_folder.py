@@ -33,6 +33,8 @@ CONFIG, EVENTS, HELD_OUT, SCENE, TRAINING, VIEWS = (
     "config.json", "events.jsonl", "held_out.json", "scene.ply", "training.json", "views.json",
 )  # fmt: skip
 METRICS, REPORT = "metrics.json", "report.html"
+EDITS = "edits.json"
+"""What was changed since the training, first to last."""
 CHECKPOINTS, CACHE, POSES = "checkpoints", "cache", "poses"
 PLAN = "plan.json"
 BLOCKS, START = "blocks", "start"
@@ -69,6 +71,15 @@ def dataset_folder_of_run(output: Path) -> Path:
         raise ConfigError(f"{output / CONFIG} cannot be read ({error}); name the folder of a run.") from None
 
 
+def _was_moved(output: Path) -> bool:
+    """Return whether the scene of a run was transformed, as its record of edits says."""
+    try:
+        edits = json.loads((output / EDITS).read_text(encoding="utf-8"))
+        return any("world_map" in edit for edit in edits)
+    except (OSError, ValueError, TypeError):
+        return False
+
+
 def photographs_folder(output: Path, scene: Path | None = None) -> Path:
     """Return the folder of a run's photographs: ``scene`` if given, else the recorded one.
 
@@ -81,6 +92,11 @@ def photographs_folder(output: Path, scene: Path | None = None) -> Path:
     noted = dataset_folder_of_run(output)
     if noted.is_absolute() and noted.is_dir():  # a downloaded run names a folder of another machine
         return noted
+    if _was_moved(output):
+        raise DatasetError(
+            f"{output} was moved, and its photographs ({noted}) stand where they stood: measure the run that "
+            "it was made of, or name photographs whose model was moved likewise with --dataset FOLDER."
+        )
     raise DatasetError(
         f"The photographs that {output} was made from ({noted}) are not on this machine; "
         "say where they are with --dataset FOLDER."

@@ -70,7 +70,7 @@ class RunSettings(BaseModel):
         description="What masks mean: ignore leaves masked pixels out of the loss, alpha takes the mask as "
         "the alpha, for objects that are cut out.",
     )
-    depth_unit: Annotated[float | None, Unit("world"), ADVANCED] = Field(
+    depth_unit: Annotated[float | None, Unit("scene units"), ADVANCED] = Field(
         None,
         gt=0,
         description="World units for one unit of the values of depth maps (depths/); by default the sparse "
@@ -101,13 +101,13 @@ class RunSettings(BaseModel):
         description="Two points and the metres between them, which decide the scale; a point is a control "
         "point, a photograph, the number of a sparse point, or x,y,z.",
     )
-    region: Annotated[BoxCorners | None, Unit("world"), Spelling(metavar="X0 Y0 Z0 X1 Y1 Z1"), ADVANCED] = (
-        Field(
-            None,
-            description="Two corners of a box to train in detail, smallest coordinates first, in the "
-            "coordinates of the COLMAP model; what lies around stays coarse. By default all of the scene is "
-            "trained alike.",
-        )
+    region: Annotated[
+        BoxCorners | None, Unit("scene units"), Spelling(metavar="X0 Y0 Z0 X1 Y1 Z1"), ADVANCED
+    ] = Field(
+        None,
+        description="Two corners of a box to train in detail, smallest coordinates first, in the "
+        "coordinates of the COLMAP model; what lies around stays coarse. By default all of the scene is "
+        "trained alike.",
     )
     minutes: Annotated[float | None, Unit("minutes"), BASIC] = Field(
         None,

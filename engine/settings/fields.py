@@ -119,6 +119,11 @@ class ReadPath:
 
 
 @dataclass(frozen=True)
+class AlsoSequence:
+    """Mark of a path in whose place Python may be given a list, which the request sorts out by itself."""
+
+
+@dataclass(frozen=True)
 class NamedFile(_InSchema):
     """Mark of a file that options name; a job finds it by name among the files that came with it."""
 

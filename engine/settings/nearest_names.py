@@ -13,10 +13,15 @@ def nearest_name(name: str, known: Iterable[str]) -> str | None:
     'ray_patch_rays'
     >>> nearest_name("quats", ["ray_patch_rays", "lr.quat"])
     'lr.quat'
+    >>> nearest_name("fov", ["fov_y_degrees", "frames"])
+    'fov_y_degrees'
     """
     names = list(known)
     if matches := get_close_matches(name, names, n=1, cutoff=0.75):
         return matches[0]
+    # a name without its unit, such as fov
+    if len(longer := [full for full in names if full.startswith(f"{name}_")]) == 1:
+        return longer[0]
     by_last_part: dict[str, str] = {}
     for full in names:
         by_last_part.setdefault(full.rpartition(".")[2], full)

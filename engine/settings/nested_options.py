@@ -4,6 +4,20 @@ from collections.abc import Mapping
 from typing import Any
 
 
+def split_dotted_names(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return options whose names may have dots as sections.
+
+    >>> split_dotted_names({"lr.quat": 1, "lr": {"mean": 2}, "iterations": 3})
+    {'lr': {'quat': 1, 'mean': 2}, 'iterations': 3}
+    """
+    result: dict[str, Any] = {}
+    for name, value in options.items():
+        for part in reversed(name.split(".")[1:]):
+            value = {part: value}
+        result = merge_options(result, {name.partition(".")[0]: value})
+    return result
+
+
 def merge_options(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     """Return ``base`` with the values of ``over``, section by section; another kind of section begins anew.
 

@@ -64,6 +64,14 @@ def fault_message(fault: Mapping[str, Any]) -> str:
         return f"must be the path of a file or folder, not {_with_article(given)}{hint}"
     if fault["type"] in ("tuple_type", "list_type"):
         return f"must be a list, not {_with_article(given)}"
+    if fault["type"] in ("too_short", "too_long"):
+        name, bound = (
+            ("min_length", "at least") if fault["type"] == "too_short" else ("max_length", "at most")
+        )
+        limit, count = fault["ctx"][name], fault["ctx"]["actual_length"]
+        return f"must have {bound} {limit} {'value' if limit == 1 else 'values'}, not {count}"
+    if fault["type"] == "missing" and isinstance(fault["loc"][-1], int):
+        return f"is missing; the {len(fault['input'])} values that are given are too few"
     return str(fault["msg"]).removeprefix("Value error, ").removesuffix(".")
 
 

@@ -92,7 +92,7 @@ def extract_levels(
         CancelledError: stopped as asked.
     """
     report = stop_when_asked(listener, should_stop, "Stopped; no surface was written.")
-    if not options.unbounded and options.bounds is None:
+    if not options.unbounded and options.box is None:
         focus_point(cameras)  # complain before the long work
     volume, region, renders = _fuse_scene(tracer, cameras, options, scratch, report)
     photographs = renders if photographs is None else photographs

@@ -40,7 +40,7 @@ def marching_cubes(volume: TsdfVolume, min_weight: float) -> TriangleMesh:
     )  # fmt: skip
     if face_counts.sum() == 0:
         raise ConfigError(
-            "No surface was found in the region to mesh; name another with --bounds, or ask for less "
+            "No surface was found in the region to mesh; name another with --box, or ask for less "
             "certainty with --min-weight."
         )
     if max(vertex_counts.sum(), face_counts.sum()) >= 2**31 - 1:

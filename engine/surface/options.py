@@ -4,24 +4,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator
 
-from octasplat.engine.core.local_origin import Box
-from octasplat.engine.settings.fields import Group, Spelling, Unit
+from octasplat.engine.settings.fields import BoxCorners, Group, Spelling, Unit
 
 _NEGATABLE = Spelling(negatable=True)
 """Of what ``room`` switches on where nothing is said."""
-
-
-def _read_box(value: object) -> object:
-    """Return the six numbers of a text with commas between them; anything else as it is."""
-    if not isinstance(value, str):
-        return value
-    try:
-        numbers = tuple(float(part) for part in value.split(","))
-    except ValueError:
-        numbers = ()
-    if len(numbers) != 6:
-        raise ValueError(f"{value!r} is not six numbers x0,y0,z0,x1,y1,z1")
-    return numbers
 
 
 def _read_rim(value: object) -> object:
@@ -46,14 +32,10 @@ class ExtractionOptions(BaseModel):
     unbounded: Annotated[bool, _NEGATABLE] = Field(
         False, description="Reach to the horizon, with ever coarser voxels, instead of meshing a box."
     )
-    bounds: Annotated[
-        Box | None,
-        Spelling(metavar="X0,Y0,Z0,X1,Y1,Z1"),
-        BeforeValidator(_read_box, json_schema_input_type=Box | str | None),
-    ] = Field(
+    box: Annotated[BoxCorners | None, Unit("scene units"), Spelling(metavar="X0 Y0 Z0 X1 Y1 Z1")] = Field(
         None,
-        description="The box to mesh, in scene units; octasplat info tells where the scene lies.  "
-        "[default: what is seen of the space that the cameras surround]",
+        description="Two corners of the box to mesh, smallest coordinates first; octasplat info tells where "
+        "the scene lies.  [default: what is seen of the space that the cameras surround]",
     )
     voxel: Annotated[float | None, Unit("scene units")] = Field(
         None,
@@ -105,7 +87,7 @@ class ExtractionOptions(BaseModel):
     refine_vertices: Annotated[bool, _NEGATABLE] = Field(
         False, description="Move vertices along their normals to where the pictures agree, before colors."
     )
-    keep_components: Annotated[int | None, Spelling(("--components",))] = Field(
+    keep_components: int | None = Field(
         None,
         ge=1,
         description="Keep so many connected parts only, largest first.  [default: by min_component]",
@@ -141,13 +123,13 @@ class ExtractionOptions(BaseModel):
             raise ValueError("voxel and resolution both say how large voxels are; give one of them")
         return resolution
 
-    @field_validator("bounds")
+    @field_validator("box")
     @classmethod
-    def _is_box(cls, bounds: Box | None, info: Any) -> Box | None:
-        if bounds is None:
+    def _has_a_volume(cls, box: BoxCorners | None, info: Any) -> BoxCorners | None:
+        if box is None:
             return None
         if info.data.get("unbounded"):
-            raise ValueError("bounds and unbounded contradict each other")
-        if not all(low < high for low, high in zip(bounds[:3], bounds[3:], strict=True)):
-            raise ValueError("bounds must be x0,y0,z0,x1,y1,z1 with x0 < x1, y0 < y1 and z0 < z1")
-        return bounds
+            raise ValueError("a box and unbounded contradict each other")
+        if not all(low < high for low, high in zip(box[:3], box[3:], strict=True)):
+            raise ValueError("the corners must be x0 y0 z0 x1 y1 z1 with x0 < x1, y0 < y1 and z0 < z1")
+        return box

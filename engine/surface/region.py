@@ -26,7 +26,7 @@ SAMPLES_PER_SIDE = 160
 OUTLIER_SHARE = 1e-3
 MARGIN_SHARE = 0.05
 NO_SURFACE_MESSAGE = (
-    "No surface lies in the region to mesh; name another with --bounds (octasplat info tells where the scene "
+    "No surface lies in the region to mesh; name another with --box (octasplat info tells where the scene "
     "lies), or use --unbounded."
 )
 _ANY_AXIS = np.array([0.36, 0.48, 0.8])
@@ -86,8 +86,8 @@ def choose_region(maps: DepthMaps, options: ExtractionOptions) -> Region:
             grid is too fine.
     """
     pixel = 0.0 if options.resolution is not None else _pixel_width(maps.cameras)
-    if options.bounds is not None:
-        low, high = np.array(options.bounds[:3]), np.array(options.bounds[3:])
+    if options.box is not None:
+        low, high = np.array(options.box[:3]), np.array(options.box[3:])
         try:
             _, distance = focus_point(maps.cameras)
         except ConfigError:
@@ -143,7 +143,7 @@ def focus_point(cameras: Sequence[PinholeCamera]) -> tuple[Float64[np.ndarray, "
         point = fit_turntable(centres, rotations[:, 2], np.tile(_ANY_AXIS, (len(centres), 1))).centre_world
     except ConfigError:
         raise ConfigError(
-            "The cameras look at no common centre; name the region to mesh with --bounds x0,y0,z0,x1,y1,z1."
+            "The cameras look at no common centre; name the region to mesh with --box x0 y0 z0 x1 y1 z1."
         ) from None
     return point, float(np.median(np.linalg.norm(centres - point, axis=1)))
 

@@ -40,13 +40,13 @@ _LABELS = {
     "where": "Where",
     "materials.learn": "Learn materials and light",
     "set.albedo": "Base color",
-    "scale.albedo": "Base color, times",
-    "scale.metallic": "Metallic, times",
-    "scale.roughness": "Roughness, times",
+    "multiply.albedo": "Base color, times",
+    "multiply.metallic": "Metallic, times",
+    "multiply.roughness": "Roughness, times",
 }
 _HIDDEN_OPTIONS = ("stage", "photographs", "camera_path")
 """Options that forms of their own, or the viewer, ask for."""
-_ASSIGNMENTS_OPTION = "assignments"
+_ASSIGNMENTS_OPTION = "set"
 """Settings by name, which a form has as fields."""
 _ACRONYMS = re.compile(r"\b(sh|ssim|l1|l2|fov)\b", re.IGNORECASE)
 _UNIT_IN_NAME = re.compile(r" (px|degrees|db|gb)$")
@@ -129,7 +129,8 @@ def _walk_schema(
     for name, raw in schema["properties"].items():
         given = _resolve_reference(root, raw)
         path = f"{prefix}{name}"
-        if path in _HIDDEN_OPTIONS or path == _ASSIGNMENTS_OPTION or "shortcut" in given:
+        is_list_of_settings = path == _ASSIGNMENTS_OPTION and "properties" not in given
+        if path in _HIDDEN_OPTIONS or is_list_of_settings or "shortcut" in given:
             continue
         if "oneOf" in given:  # one of several sections, told apart by their kind
             yield from _variant_fields(root, given, path, presets)
@@ -219,6 +220,9 @@ def _control_of_array(name: str, schema: Mapping[str, Any]) -> Control:
 
 def _control_of_several(options: Sequence[Mapping[str, Any]]) -> tuple[Control, Sequence[str]]:
     """Return the control of a union of types: a choice where all values are known, else text."""
+    # a file is chosen, whatever else programs may send in its place
+    if any(option.get("format") == "octasplat-file" for option in options):
+        return "upload", ()
     values: list[str] = []
     for option in options:
         if option.get("type") == "null":

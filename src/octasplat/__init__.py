@@ -4,7 +4,7 @@
 >>> scene = osp.load("scene.ply")
 >>> scene
 Scene(1,200 Gaussians, harmonics of degree 1)
->>> image = osp.render(scene, scene.camera(width=96, height=64))
+>>> image = osp.render(scene, scene.camera(width_px=96, height_px=64))
 >>> image.rgb.shape
 (64, 96, 3)
 

@@ -14,7 +14,7 @@ from octasplat.paths import PathLike
 from octasplat.workers.client import submission
 from octasplat.workers.client.api import Api, ServiceError, ServiceUnreachableError, find_address, find_token
 from octasplat.workers.client.bucket import is_bucket_address
-from octasplat.workers.client.dataset_tasks import import_scene, is_web_address
+from octasplat.workers.client.dataset_tasks import import_dataset, is_web_address
 from octasplat.workers.client.submission import Derivation, JobFailedError, Submission
 
 JobState = Literal["queued", "running", "canceling", "succeeded", "failed", "canceled"]
@@ -151,7 +151,7 @@ class Client:
         )
         return Job(self._api, submission.derive(self._api, what, progress or default_progress()))
 
-    def import_scene(self, url: str, *, name: str | None = None, sha256: str | None = None) -> str:
+    def import_dataset(self, url: str, *, name: str | None = None, sha256: str | None = None) -> str:
         """Let the service fetch photographs, and return the id of their dataset, which :meth:`submit` takes.
 
         Args:
@@ -163,7 +163,7 @@ class Client:
             ServiceError: the address does not answer well, or the service refuses the photographs.
             ServiceUnreachableError: the service was away for two minutes.
         """
-        return str(import_scene(self._api, url, name=name, sha256=sha256)["id"])
+        return str(import_dataset(self._api, url, name=name, sha256=sha256)["id"])
 
     def job(self, job_id: str) -> "Job":
         """Return the job with an id.

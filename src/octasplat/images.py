@@ -13,7 +13,7 @@ from jaxtyping import Float32, Int32
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.rays import ImageRays
 from octasplat.engine.render.pinhole_camera import PinholeCamera
-from octasplat.operation_calls import names_checked
+from octasplat.operation_calls import check_threads, names_checked
 from octasplat.paths import PathLike
 from octasplat.scenes import Scene
 
@@ -37,7 +37,7 @@ class Image:
 
     >>> import octasplat as osp
     >>> scene = osp.load("scene.ply")
-    >>> image = osp.render(scene, scene.camera(width=96, height=64))
+    >>> image = osp.render(scene, scene.camera(width_px=96, height_px=64))
     >>> image.rgb.shape, image.depth.shape, image.normal.shape, image.alpha.shape
     ((64, 96, 3), (64, 96), (64, 96, 3), (64, 96))
     >>> image.gaussian.shape, int(image.gaussian.max()) < len(scene)
@@ -72,7 +72,7 @@ class Image:
 
         >>> import octasplat as osp
         >>> scene = osp.load("scene.ply")
-        >>> osp.render(scene, scene.camera(width=96, height=64)).save("view.png").name
+        >>> osp.render(scene, scene.camera(width_px=96, height_px=64)).save("view.png").name
         'view.png'
         """
         from octasplat.engine.render.image_files import exr_layers, write_exr, write_png
@@ -125,13 +125,14 @@ def render(
         threads: 0 takes all cores; the result does not depend on it.
 
     Raises:
-        ConfigError: materials are asked for, and the scene has none, or no light; or the background or the
-            shading is none.
+        ConfigError: materials are asked for, and the scene has none, or no light; or the background, the
+            shading or the number of threads is none.
     """
     from octasplat.engine.gaussians.materials import is_material_known
     from octasplat.engine.render.shots import scene_image
     from octasplat.engine.shading.plain import PLAIN_SHADING
 
+    check_threads(threads)
     behind = _background_color(background)
     if shading not in (None, *get_args(Shading)):
         raise ConfigError(f"shading: {shading!r} is neither 'materials' nor 'harmonics'.")

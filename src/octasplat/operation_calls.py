@@ -76,8 +76,7 @@ def run_operation(
         ConfigError: a value cannot be used; the sentence is that of the command.
         OctasplatError: as the operation does.
     """
-    if threads < 0:
-        raise ConfigError(f"threads: must be 0, which takes all cores, or more (it is {threads}).")
+    check_threads(threads)
     verb = operation(name)
     request = build_request(verb.request, explicit_values(verb.request, values))
     result = verb.execute(
@@ -85,6 +84,16 @@ def run_operation(
     )
     remember_written(name, result.files)
     return result
+
+
+def check_threads(threads: int) -> None:
+    """Refuse what is no number of threads.
+
+    Raises:
+        ConfigError: it is below 0.
+    """
+    if threads < 0:
+        raise ConfigError(f"threads: must be 0, which takes all cores, or more (it is {threads}).")
 
 
 def explicit_values(model: type[BaseModel], values: Mapping[str, Any]) -> dict[str, Any]:

@@ -58,5 +58,8 @@ def render(source: Scene | PathLike, target: PinholeCamera | PathLike, /, **opti
     if isinstance(source, Scene) and isinstance(target, PinholeCamera):
         return images.render(source, target, **options)
     if isinstance(source, Scene) or isinstance(target, PinholeCamera):
-        raise TypeError("a scene in memory goes with a camera, a file or run with a place for pictures")
+        raise TypeError(
+            "a scene in memory goes with one camera (run.scene is the scene of a run), a file or a run with "
+            "a place for pictures"
+        )
     return verbs.render(source, target, **options)

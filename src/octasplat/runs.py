@@ -18,8 +18,8 @@ from octasplat.scenes import Scene, load
 if TYPE_CHECKING:
     from octasplat.engine.render.pinhole_camera import PinholeCamera
 
-_CONFIG, _METRICS, _REPORT, _SCENE, _TRAINING = (
-    "config.json", "metrics.json", "report.html", "scene.ply", "training.json",
+_CONFIG, _EDITS, _METRICS, _REPORT, _SCENE, _TRAINING = (
+    "config.json", "edits.json", "metrics.json", "report.html", "scene.ply", "training.json",
 )  # fmt: skip
 OnStep = Callable[[TrainingProgress], bool | None]
 """Called with the state of the training every few iterations; returning False stops it."""
@@ -96,8 +96,13 @@ class Run:
 
     @property
     def is_finished(self) -> bool:
-        """Return whether the scene is trained and evaluated; if not, :func:`reconstruct` resumes it."""
-        return (self.path / _SCENE).exists() and (self.path / _METRICS).exists()
+        """Return whether the scene is there as it is to be; if not, :func:`reconstruct` resumes the run.
+
+        That is a scene that was trained and evaluated, or one that an edit has made of it, which
+        :func:`evaluate` measures.
+        """
+        is_done = (self.path / _METRICS).exists() or (self.path / _EDITS).exists()
+        return is_done and (self.path / _SCENE).exists()
 
     @property
     def metrics(self) -> Mapping[str, Any]:

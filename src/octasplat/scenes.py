@@ -1,9 +1,10 @@
 """Scenes in memory: their parameters as arrays, read from and written to files of any format."""
 
-from collections.abc import Mapping
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64
@@ -100,16 +101,23 @@ class Scene:
         ... )
         Scene(1 Gaussian, harmonics of degree 0)
         """
-        count = len(means)
-        _check_sh(np.asarray(sh), count)
+        count, coefficients = len(means), _as_numpy(sh)
+        _check_sh(coefficients, count)
+        further: dict[str, Float32[np.ndarray, "n f"]] = {}
+        for name, values in (channels or {}).items():
+            further[name] = np.array(_as_numpy(values), np.float32)
+            if further[name].ndim != 2 or len(further[name]) != count:
+                raise ConfigError(
+                    f"channels: {name!r} has the shape {further[name].shape}; it must be ({count}, f)."
+                )
         return cls(
             FlatGaussians(
                 _rows("means", means, (count, 3)),
                 _rows("quats", quats, (count, 4)),
                 _rows("scales", _log_scales(scales), (count, 2)),
                 _rows("opacities", _opacity_logits(opacities), (count,)),
-                np.array(sh, np.float32),
-                Channels({name: np.array(rows, np.float32) for name, rows in (channels or {}).items()}),
+                np.array(coefficients, np.float32),
+                Channels(further),
             )
         )
 
@@ -166,7 +174,7 @@ class Scene:
 
     @sh.setter
     def sh(self, values: Float[np.ndarray, "n k 3"]) -> None:
-        coefficients = np.asarray(values)
+        coefficients = _as_numpy(values)
         _check_sh(coefficients, len(self))
         if coefficients.shape == self.gaussians.sh.shape:
             # In place, as somebody may hold a view of the array.
@@ -189,15 +197,18 @@ class Scene:
         """Unit normals, a copy."""
         return self.gaussians.rotations[:, :, 0].copy()
 
-    def select(self, index: RowIndex) -> "Scene":
-        """Return the Gaussians of an index, a mask or a slice, copied.
+    def select(self, index: RowIndex | Sequence[int] | int) -> "Scene":
+        """Return the Gaussians of numbers, a mask or a slice, copied; of a single number, one Gaussian.
 
         >>> import octasplat as osp
         >>> scene = osp.load("scene.ply")
         >>> len(scene.select(scene.opacities > 0.5)) < len(scene)
         True
         """
-        return self._with(self.gaussians.select(index))
+        rows = index if isinstance(index, slice) else np.atleast_1d(_as_numpy(index))
+        if len(self) and not isinstance(rows, slice) and rows.size == 0:
+            rows = np.zeros(0, np.int64)  # of an empty list, which has no type
+        return self._with(self.gaussians.select(rows))
 
     def copy(self) -> "Scene":
         """Return an independent copy."""
@@ -213,18 +224,25 @@ class Scene:
 
         return self.trained_with or TraceSettings(flip_normal_cos=self.facts.turned_beyond)
 
-    def camera(self, width: int = 640, height: int = 480, *, fov: float | None = None) -> "PinholeCamera":
+    def camera(
+        self, width_px: int = 640, height_px: int = 480, *, fov_y_degrees: float | None = None
+    ) -> "PinholeCamera":
         """Return the first camera of :meth:`turntable`.
 
         >>> import octasplat as osp
-        >>> camera = osp.load("scene.ply").camera(width=96, height=64)
+        >>> camera = osp.load("scene.ply").camera(width_px=96, height_px=64)
         >>> camera.width_px, camera.height_px
         (96, 64)
         """
-        return self.turntable(1, width, height, fov=fov)[0]
+        return self.turntable(1, width_px, height_px, fov_y_degrees=fov_y_degrees)[0]
 
     def turntable(
-        self, frames: int, width: int = 640, height: int = 480, *, fov: float | None = None
+        self,
+        frames: int,
+        width_px: int = 640,
+        height_px: int = 480,
+        *,
+        fov_y_degrees: float | None = None,
     ) -> tuple["PinholeCamera", ...]:
         """Return cameras that go round the scene once, as those of :func:`octasplat.render` do.
 
@@ -234,9 +252,9 @@ class Scene:
 
         Args:
             frames: how many cameras.
-            width: of their images, px.
-            height: of their images, px.
-            fov: angle of view from top to bottom, degrees; by default that of the photographs, or 50.
+            width_px: of their images.
+            height_px: of their images.
+            fov_y_degrees: angle of view from top to bottom; by default that of the photographs, or 50.
 
         Raises:
             ConfigError: there are no frames, or an image has no pixels or no field of view.
@@ -248,9 +266,9 @@ class Scene:
         from octasplat.engine.render.orbit import Orbit, PinholeLens, choose_fov_y_degrees, orbit_cameras
         from octasplat.engine.render.pinhole_camera import check_lens
 
-        angle = choose_fov_y_degrees(fov, self.viewpoints)
-        check_lens(width, height, angle)
-        lens, orbit = PinholeLens(width, height, angle), Orbit(np.array([0.0, -1.0, 0.0]))
+        angle = choose_fov_y_degrees(fov_y_degrees, self.viewpoints)
+        check_lens(width_px, height_px, angle)
+        lens, orbit = PinholeLens(int(width_px), int(height_px), angle), Orbit(np.array([0.0, -1.0, 0.0]))
         try:
             cameras = orbit_cameras(self.gaussians, self.viewpoints, lens, orbit, frames)
         except ConfigError:
@@ -282,9 +300,14 @@ class Scene:
         )
 
 
+def _as_numpy(values: Any) -> np.ndarray:
+    """Return an array of what may also be a list, or a tensor with gradients or of another device."""
+    return np.asarray(values.detach().cpu() if hasattr(values, "detach") else values)
+
+
 def _rows(name: str, values: Float[np.ndarray, "..."], shape: tuple[int, ...]) -> Float32[np.ndarray, "..."]:
     """Return a copy as float32; refuses another shape, and what no file of a scene may hold."""
-    rows = np.array(values, np.float32)
+    rows = np.array(_as_numpy(values), np.float32)
     if rows.shape != shape:
         raise ConfigError(f"{name}: has the shape {rows.shape}; it must be {shape}.")
     if not np.isfinite(rows).all():
@@ -310,7 +333,7 @@ def _check_sh(values: Float[np.ndarray, "..."], count: int) -> None:
 
 def _log_scales(scales: Float[np.ndarray, "..."]) -> Float64[np.ndarray, "..."]:
     """Return the logarithms of standard deviations; refuses those that have none."""
-    values = np.asarray(scales, np.float64)
+    values = np.asarray(_as_numpy(scales), np.float64)
     if not (np.isfinite(values) & (values > 0)).all():
         raise ConfigError("scales: must be finite and above 0.")
     return np.log(values)
@@ -318,7 +341,7 @@ def _log_scales(scales: Float[np.ndarray, "..."]) -> Float64[np.ndarray, "..."]:
 
 def _opacity_logits(opacities: Float[np.ndarray, "..."]) -> Float64[np.ndarray, "..."]:
     """Return what the sigmoid turns into opacities, finite for 0 and 1, too; refuses what is none."""
-    values = np.asarray(opacities, np.float64)
+    values = np.asarray(_as_numpy(opacities), np.float64)
     if not ((values >= 0) & (values <= 1)).all():
         raise ConfigError("opacities: must be from 0 to 1.")
     # The logarithm of 0 is -inf, which the clip makes finite.
@@ -340,11 +363,14 @@ def load(source: PathLike, *, drop_invalid: bool = False) -> Scene:
     Raises:
         SceneFileError: the file cannot be read.
         ConfigError: a run's settings or light cannot be read.
+        TypeError: what is given is no path.
 
     >>> import octasplat as osp
     >>> osp.load("scene.ply")
     Scene(1,200 Gaussians, harmonics of degree 1)
     """
+    if not isinstance(source, str | os.PathLike):
+        raise TypeError(f"load takes the path of a file or run, not {source!r}")
     return read_scene(Path(source), log_event, drop_invalid=drop_invalid)
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import FunctionCtx, once_differentiable
 
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.scene_metadata import UNKNOWN_METADATA, SceneMetadata
@@ -18,6 +19,7 @@ from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import TraceGradients, Tracer, TraceSettings
 from octasplat.engine.trace.ray_gradients import ray_gradients
+from octasplat.operation_calls import check_threads
 from octasplat.scenes import Scene
 
 _MIN_ALPHA = 1e-8
@@ -89,7 +91,7 @@ class Rays:
         t_max: distance at which they end.
 
     >>> import octasplat as osp
-    >>> rays = osp.Rays.of(osp.load("scene.ply").camera(width=96, height=64))
+    >>> rays = osp.Rays.of(osp.load("scene.ply").camera(width_px=96, height_px=64))
     >>> rays.origins.shape, rays.directions.shape
     (torch.Size([1, 3]), torch.Size([6144, 3]))
     >>> rays[:100].directions.shape
@@ -134,7 +136,7 @@ class TracedRays:
 
     >>> import octasplat as osp
     >>> scene = osp.load("scene.ply")
-    >>> seen = osp.trace(scene, scene.camera(width=96, height=64))
+    >>> seen = osp.trace(scene, scene.camera(width_px=96, height_px=64))
     >>> picture = (seen.rgb + (1 - seen.alpha)[:, None]).reshape(64, 96, 3)  # over white
     >>> picture.shape
     torch.Size([64, 96, 3])
@@ -168,20 +170,30 @@ def trace(
         settings: where rays are cut off; None takes those of the scene's run, or the usual ones.
         threads: 0 takes all cores.
 
+    Raises:
+        ConfigError: tensors do not have the shapes that their classes name, or the number of threads is none.
+        TypeError: what is given is no scene or no rays.
+
     >>> import octasplat as osp
     >>> scene = osp.load("scene.ply")
     >>> parameters = osp.GaussianTensors.of(scene)
-    >>> seen = osp.trace(parameters, scene.camera(width=96, height=64))
+    >>> seen = osp.trace(parameters, scene.camera(width_px=96, height_px=64))
     >>> seen.rgb.shape, seen.depth.shape, seen.normal.shape, seen.alpha.shape
     (torch.Size([6144, 3]), torch.Size([6144]), torch.Size([6144, 3]), torch.Size([6144]))
     >>> (1 - seen.alpha).mean().backward()
     >>> parameters.opacity_logits.grad.shape
     torch.Size([1200])
     """
+    check_threads(threads)
+    if not isinstance(scene, Scene | GaussianTensors):
+        raise TypeError(f"trace takes a Scene or GaussianTensors, not {type(scene).__name__}")
+    if not isinstance(rays, Rays | PinholeCamera):
+        raise TypeError(f"trace takes Rays or one camera, not {type(rays).__name__}")
     given = GaussianTensors.of(scene, requires_grad=False) if isinstance(scene, Scene) else scene
     if settings is None:
         settings = scene.trained_with or TraceSettings(flip_normal_cos=scene.facts.turned_beyond)
     lines = Rays.of(rays) if isinstance(rays, PinholeCamera) else rays
+    _check_shapes(given, lines)
     # By torch, so that the gradients of directions of any length are right.
     directions = lines.directions / lines.directions.norm(dim=-1, keepdim=True)
     features = given.features
@@ -198,6 +210,40 @@ def trace(
     # The inner choice keeps 0/0 out of the other branch, whose gradient would be NaN for all.
     depth = torch.where(met, depth_sum / torch.where(met, alpha, 1.0), 0.0)
     return TracedRays(rgb, alpha, depth, depth_median, normal, extra)
+
+
+def _check_shapes(given: GaussianTensors, rays: Rays) -> None:
+    """Refuse tensors of other shapes than the kernels read, which would read beyond them.
+
+    Raises:
+        ConfigError: one has another shape; the sentence names it.
+    """
+    n, r = len(given.means), len(rays.directions)
+    for name, wanted in (
+        ("means", (n, 3)),
+        ("quats", (n, 4)),
+        ("log_scales", (n, 2)),
+        ("opacity_logits", (n,)),
+        ("sh", (n, None, 3)),
+        ("features", (n, None)),
+    ):
+        if (tensor := getattr(given, name)) is not None:
+            _check_shape(name, tensor, wanted)
+    if given.sh.shape[1] not in (1, 4, 9, 16):
+        raise ConfigError(f"sh: has {given.sh.shape[1]} coefficients a Gaussian; it must be 1, 4, 9 or 16.")
+    _check_shape("directions", rays.directions, (r, 3))
+    _check_shape("origins", rays.origins, (1 if len(rays.origins) == 1 else r, 3))
+
+
+def _check_shape(name: str, tensor: Tensor, wanted: tuple[int | None, ...]) -> None:
+    if not isinstance(tensor, Tensor):
+        raise ConfigError(f"{name}: must be a tensor of torch, not {type(tensor).__name__}.")
+    shape = tuple(tensor.shape)
+    if len(shape) != len(wanted) or any(
+        side not in (None, own) for own, side in zip(shape, wanted, strict=True)
+    ):
+        text = ", ".join("k" if side is None else str(side) for side in wanted)
+        raise ConfigError(f"{name}: has the shape {shape}; it must be ({text}{',' * (len(wanted) == 1)}).")
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 from pydantic import BaseModel
 
+from octasplat.array_types import Matrix, Numbers
 from octasplat.engine.core.events import EventListener
 from octasplat.engine.operations.base import never_stop
 from octasplat.operation_calls import names_checked, run_operation
@@ -43,8 +44,8 @@ class RenderArguments(TypedDict, total=False):
     views: Literal["held-out", "train", "all"] | None
     photographs: Sequence[str] | None
     camera_path: BaseModel | Mapping[str, Any] | str | None
-    camera: Sequence[float] | None
-    look_at: Sequence[float] | None
+    camera: Numbers | None
+    look_at: Numbers | None
     distance: float | None
     elevation_degrees: float | None
     frames: int | None
@@ -95,7 +96,7 @@ def reconstruct(
     georeference: Literal["auto", "gps", "off"] | None = None,
     control_points: str | None = None,
     known_length: str | None = None,
-    region: Sequence[float] | None = None,
+    region: Numbers | None = None,
     minutes: float | None = None,
     exports: Sequence[str] | None = None,
     materials: bool = False,
@@ -106,8 +107,8 @@ def reconstruct(
     sh_degree: int | None = None,
     seed: int | None = None,
     train: Mapping[str, Any] | None = None,
-    assignments: Sequence[str] | None = None,
-    frames_per_second: float | None = None,
+    set: Sequence[str] | Mapping[str, Any] | str | None = None,
+    fps: float | None = None,
     start_from: PathLike | None = None,
     resume: bool = False,
     on_step: OnStep | None = None,
@@ -177,11 +178,11 @@ def reconstruct(
         max_gaussians: Most Gaussians; 0, the default, asks the photographs' pixels.
         sh_degree: Degree of the spherical harmonics of the colors, 0 to 3.
         seed: Seed of everything random. [default: 0]
-        train: Settings of the training that are to be otherwise than the preset's.
-        assignments: Any other setting, e.g. lr.quat=0.02 or test_every=4, values as JSON; octasplat
-            config list shows them.
-        frames_per_second: Of a video: so many frames of each second are taken, the sharpest ones.
-            Default: 2.0.
+        train: Settings of the training that are to be otherwise than the preset's, by names or in
+            sections.
+        set: Any other setting, e.g. lr.quat=0.02 or test_every=4, values as JSON; octasplat config list
+            shows them.
+        fps: Of a video: so many frames of each second are taken, the sharpest ones. Default: 2.0.
         start_from: Begin with the Gaussians of that run, finished or stopped, or of a file of
             Gaussians, instead of the sparse points; poses that the run found are taken, too.
         resume: Go on with the run in the output folder, if there is one; without other options its own
@@ -236,10 +237,10 @@ def reconstruct(
             "sh_degree": sh_degree,
             "seed": seed,
             "train": train,
-            "assignments": assignments,
+            "set": set,
             "source": source,
             "output": output,
-            "frames_per_second": frames_per_second,
+            "fps": fps,
             "start_from": start_from,
             "resume": resume,
         },
@@ -268,7 +269,7 @@ def estimate(
     georeference: Literal["auto", "gps", "off"] | None = None,
     control_points: str | None = None,
     known_length: str | None = None,
-    region: Sequence[float] | None = None,
+    region: Numbers | None = None,
     minutes: float | None = None,
     exports: Sequence[str] | None = None,
     materials: bool = False,
@@ -279,9 +280,9 @@ def estimate(
     sh_degree: int | None = None,
     seed: int | None = None,
     train: Mapping[str, Any] | None = None,
-    assignments: Sequence[str] | None = None,
+    set: Sequence[str] | Mapping[str, Any] | str | None = None,
     cores: int | None = None,
-    frames_per_second: float | None = None,
+    fps: float | None = None,
     progress: EventListener | None = None,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
@@ -342,11 +343,12 @@ def estimate(
         max_gaussians: Most Gaussians; 0, the default, asks the photographs' pixels.
         sh_degree: Degree of the spherical harmonics of the colors, 0 to 3.
         seed: Seed of everything random. [default: 0]
-        train: Settings of the training that are to be otherwise than the preset's.
-        assignments: Any other setting, e.g. lr.quat=0.02 or test_every=4, values as JSON; octasplat
-            config list shows them.
+        train: Settings of the training that are to be otherwise than the preset's, by names or in
+            sections.
+        set: Any other setting, e.g. lr.quat=0.02 or test_every=4, values as JSON; octasplat config list
+            shows them.
         cores: Cores of the machine to reckon with; 0 takes those of this one. Default: 0.
-        frames_per_second: Of a video: so many frames of each second would be taken. Default: 2.0.
+        fps: Of a video: so many frames of each second would be taken. Default: 2.0.
         progress: told each event; by default they are logged, or shown in a notebook.
         should_stop: asked now and then; True ends the work with ``CancelledError``.
         threads: number of threads; 0 takes all cores. The result does not depend on it.
@@ -387,10 +389,10 @@ def estimate(
             "sh_degree": sh_degree,
             "seed": seed,
             "train": train,
-            "assignments": assignments,
+            "set": set,
             "cores": cores,
             "source": source,
-            "frames_per_second": frames_per_second,
+            "fps": fps,
         },
         progress,
         should_stop,
@@ -419,7 +421,7 @@ def plan(
     georeference: Literal["auto", "gps", "off"] | None = None,
     control_points: str | None = None,
     known_length: str | None = None,
-    region: Sequence[float] | None = None,
+    region: Numbers | None = None,
     minutes: float | None = None,
     exports: Sequence[str] | None = None,
     materials: bool = False,
@@ -430,7 +432,7 @@ def plan(
     sh_degree: int | None = None,
     seed: int | None = None,
     train: Mapping[str, Any] | None = None,
-    assignments: Sequence[str] | None = None,
+    set: Sequence[str] | Mapping[str, Any] | str | None = None,
     cores: int | None = None,
     picture: PathLike | None = None,
     progress: EventListener | None = None,
@@ -500,9 +502,10 @@ def plan(
         max_gaussians: Most Gaussians; 0, the default, asks the photographs' pixels.
         sh_degree: Degree of the spherical harmonics of the colors, 0 to 3.
         seed: Seed of everything random. [default: 0]
-        train: Settings of the training that are to be otherwise than the preset's.
-        assignments: Any other setting, e.g. lr.quat=0.02 or test_every=4, values as JSON; octasplat
-            config list shows them.
+        train: Settings of the training that are to be otherwise than the preset's, by names or in
+            sections.
+        set: Any other setting, e.g. lr.quat=0.02 or test_every=4, values as JSON; octasplat config list
+            shows them.
         cores: Cores of the machine to reckon with; 0 takes those of this one. Default: 0.
         picture: Write a map of the points from above, a color a block, and of the cameras, in black.
         progress: told each event; by default they are logged, or shown in a notebook.
@@ -548,7 +551,7 @@ def plan(
             "sh_degree": sh_degree,
             "seed": seed,
             "train": train,
-            "assignments": assignments,
+            "set": set,
             "cores": cores,
             "source": source,
             "picture": picture,
@@ -674,7 +677,7 @@ def surface(
     *,
     overwrite: bool = False,
     unbounded: bool | None = None,
-    bounds: Sequence[float] | str | None = None,
+    box: Numbers | None = None,
     voxel: float | None = None,
     resolution: int | None = None,
     truncation: float | None = None,
@@ -710,8 +713,8 @@ def surface(
         overwrite: Replace files that are there already, too, which are not of an earlier run of this
             command or were changed since. What is read is never replaced.
         unbounded: Reach to the horizon, with ever coarser voxels, instead of meshing a box.
-        bounds: The box to mesh, in scene units; octasplat info tells where the scene lies. [default:
-            what is seen of the space that the cameras surround]
+        box: Two corners of the box to mesh, smallest coordinates first; octasplat info tells where the
+            scene lies. [default: what is seen of the space that the cameras surround]
         voxel: Side of a voxel, in scene units, at the centre where unbounded. [default: as resolution
             says]
         resolution: Voxels along the longest side of the box. [default: 512, or fewer where a voxel
@@ -736,7 +739,7 @@ def surface(
         texture_size: Colors in a square texture of this side instead of in the vertices; .glb, .obj and
             .usdz.
         max_memory_gb: Refuse a volume that takes more memory than this. Default: 4.0.
-        room: What pictures of a room need, where nothing else is said: unbounded (not with bounds),
+        room: What pictures of a room need, where nothing else is said: unbounded (not with a box),
             unseen solid, backdrop, refine_vertices, and finer voxels than a box has.
         max_triangles: Decimate to so many triangles, such as 60000 or 60k; 5k,50k,500k writes a file
             each, NAME_5k.glb. [default: all]
@@ -763,7 +766,7 @@ def surface(
         {
             "overwrite": overwrite,
             "unbounded": unbounded,
-            "bounds": bounds,
+            "box": box,
             "voxel": voxel,
             "resolution": resolution,
             "truncation": truncation,
@@ -803,10 +806,10 @@ def material(
     *,
     overwrite: bool = False,
     set: BaseModel | Mapping[str, Any] | str | None = None,
-    scale: BaseModel | Mapping[str, Any] | str | None = None,
+    multiply: BaseModel | Mapping[str, Any] | str | None = None,
     where: str | None = None,
-    box: Sequence[float] | None = None,
-    sphere: Sequence[float] | None = None,
+    box: Numbers | None = None,
+    sphere: Numbers | None = None,
     inverse: bool = False,
     mesh: PathLike | None = None,
     masks: Sequence[PathLike] | PathLike | None = None,
@@ -823,7 +826,7 @@ def material(
             command or were changed since. What is read is never replaced.
         set: Values to set: albedo=R,G,B (linear, 0 to 1), albedo=#rrggbb (display), metallic=0..1 or
             roughness=0..1.
-        scale: Factors to multiply albedo, metallic or roughness by; the result is at most 1.
+        multiply: Factors to multiply albedo, metallic or roughness by; the result is at most 1.
         where: Comparisons joined by and, or, not that hold for them, of x, y, z, opacity and channels
             such as metallic, roughness and albedo.r: 'metallic > 0.5 and z < 0'.
         box: Two corners of a box that their centres lie in, smallest coordinates first.
@@ -851,7 +854,7 @@ def material(
             "source": source,
             "output": output,
             "set": set,
-            "scale": scale,
+            "multiply": multiply,
             "where": where,
             "box": box,
             "sphere": sphere,
@@ -875,8 +878,8 @@ def render(
     views: Literal["held-out", "train", "all"] | None = None,
     photographs: Sequence[str] | None = None,
     camera_path: BaseModel | Mapping[str, Any] | str | None = None,
-    camera: Sequence[float] | None = None,
-    look_at: Sequence[float] | None = None,
+    camera: Numbers | None = None,
+    look_at: Numbers | None = None,
     distance: float | None = None,
     elevation_degrees: float | None = None,
     frames: int | None = None,
@@ -1026,8 +1029,8 @@ def relight(
     views: Literal["held-out", "train", "all"] | None = None,
     photographs: Sequence[str] | None = None,
     camera_path: BaseModel | Mapping[str, Any] | str | None = None,
-    camera: Sequence[float] | None = None,
-    look_at: Sequence[float] | None = None,
+    camera: Numbers | None = None,
+    look_at: Numbers | None = None,
     distance: float | None = None,
     elevation_degrees: float | None = None,
     frames: int | None = None,
@@ -1219,7 +1222,7 @@ def export(
     falloff_texture_size: int | None = None,
     ids: bool = True,
     q: float | None = None,
-    color: Literal["cameras", "constant"] | Sequence[float] | str | None = None,
+    color: Literal["cameras", "constant"] | Numbers | str | None = None,
     for_viewers: bool = False,
     extent: Literal["photographed", "all"] | None = None,
     materials: bool = False,
@@ -1299,7 +1302,7 @@ def export(
 
 @names_checked
 def import_(
-    file: PathLike,
+    source: PathLike,
     output: PathLike,
     *,
     overwrite: bool = False,
@@ -1314,7 +1317,7 @@ def import_(
     """Splats of any format to a scene of flat Gaussians.
 
     Args:
-        file: The scene to read, a file of any known format.
+        source: The scene to read, a file of any known format.
         output: The scene to write.
         overwrite: Replace files that are there already, too, which are not of an earlier run of this
             command or were changed since. What is read is never replaced.
@@ -1339,7 +1342,7 @@ def import_(
         "import",
         {
             "overwrite": overwrite,
-            "file": file,
+            "source": source,
             "format": format,
             "drop_invalid": drop_invalid,
             "sh_degree": sh_degree,
@@ -1506,12 +1509,12 @@ def transform(
     output: PathLike,
     *,
     overwrite: bool = False,
-    matrix: PathLike | None = None,
+    matrix: PathLike | Matrix | None = None,
     up: Sequence[Literal["x", "-x", "y", "-y", "z", "-z"]] | None = None,
     scale: float | None = None,
     rotate: Sequence[Sequence[Literal["x", "y", "z"] | float]] | None = None,
-    translate: Sequence[float] | None = None,
-    about: Sequence[float] | None = None,
+    translate: Numbers | None = None,
+    about: Numbers | None = None,
     progress: EventListener | None = None,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
@@ -1524,8 +1527,8 @@ def transform(
             writes a folder that is a run again, with what of it stays valid.
         overwrite: Replace files that are there already, too, which are not of an earlier run of this
             command or were changed since. What is read is never replaced.
-        matrix: A text file with an affine 4 x 4 or 3 x 4 matrix, row by row, that maps old points to
-            new ones.
+        matrix: An affine 4 x 4 or 3 x 4 matrix that maps old points to new ones, row by row: a text
+            file or, in Python and JSON, its rows.
         up: Turn the axis that points up to another: -y z from COLMAP's usual frame to Blender's.
         scale: Scale by a factor.
         rotate: Turn about an axis, counter-clockwise seen from its tip; may be repeated.
@@ -1541,6 +1544,9 @@ def transform(
     >>> import octasplat as osp
     >>> osp.transform("scene.ply", "moved.ply", translate=(0, 0, 1), scale=2).count
     1200
+    >>> import numpy as np
+    >>> osp.transform("scene.ply", "mirrored.ply", matrix=np.diag([-1, 1, 1, 1])).matrix[0]
+    (-1.0, 0.0, 0.0, 0.0)
     """
     return run_operation(
         "transform",
@@ -1568,8 +1574,8 @@ def crop(
     *,
     overwrite: bool = False,
     where: str | None = None,
-    box: Sequence[float] | None = None,
-    sphere: Sequence[float] | None = None,
+    box: Numbers | None = None,
+    sphere: Numbers | None = None,
     inverse: bool = False,
     progress: EventListener | None = None,
     should_stop: Callable[[], bool] = never_stop,
@@ -1619,7 +1625,7 @@ def crop(
 
 @names_checked
 def merge(
-    source: PathLike,
+    source: Sequence[PathLike] | PathLike,
     output: PathLike,
     scenes: Sequence[PathLike] | PathLike | None = None,
     *,
@@ -1632,7 +1638,8 @@ def merge(
     """Put scenes together.
 
     Args:
-        source: The scene to read: a file of any format, or the folder of a run.
+        source: The first scene: a file of any format, or the folder of a run. Python also takes a list
+            of all scenes here.
         output: The scene to write; the suffix says in which format. Of a run, a name without suffix
             writes a folder that is a run again, with what of it stays valid.
         scenes: The other scenes: files of any format, each in the same frame.
@@ -1647,8 +1654,8 @@ def merge(
         OctasplatError: something cannot be read, done or written; the text says what.
 
     >>> import octasplat as osp
-    >>> len(osp.load(osp.merge("scene.ply", "both.ply", ["shiny.ply"]).files[0]))
-    2400
+    >>> osp.merge(["scene.ply", "shiny.ply"], "both.ply").counts
+    (1200, 1200)
     """
     return run_operation(
         "merge",

@@ -55,7 +55,14 @@ def test_folder_without_a_run_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "options", [{"preset": "fastest"}, {"assignments": ["iteratoins=3"]}, {"train": {"raise": 3}}]
+    "options",
+    [
+        {"preset": "fastest"},
+        {"set": ["iteratoins=3"]},
+        {"set": {"iteratoins": 3}},
+        {"set": "lr.quat"},
+        {"train": {"raise": 3}},
+    ],
 )
 def test_refused_settings_have_the_sentence_of_the_command(
     options: dict[str, Any], photographs: Path, tmp_path: Path
@@ -133,7 +140,7 @@ def test_notebook_shows_progress_and_ends_with_lines() -> None:
 def test_run_images_match_operation_result(finished_run: Path, tmp_path: Path) -> None:
     found = osp.render(osp.Run(finished_run), tmp_path / "views", views="held-out")
     assert found.images == 2 and all(path.is_file() for path in found.files)
-    with pytest.raises(TypeError, match="goes with a camera"):
+    with pytest.raises(TypeError, match="goes with one camera"):
         osp.render(osp.load(finished_run), tmp_path / "views")  # type: ignore[call-overload]
 
 
@@ -143,7 +150,7 @@ def test_scene_of_run_is_traced_as_the_run_was(finished_run: Path, tmp_path: Pat
     content["reconstruction"]["train"]["trace"] |= {"q": 4.0, "transmittance_min": 0.3}
     (run / "config.json").write_text(json.dumps(content))
     scene = osp.load(run)
-    camera = scene.camera(width=48, height=36, fov=50.0)
+    camera = scene.camera(width_px=48, height_px=36, fov_y_degrees=50.0)
     pose = {"camera_to_world": camera.world_from_cam.tolist(), "fov_y_degrees": 50.0}
     path = {"width": 48, "height": 36, "frames": [pose]}
     osp.render(run, tmp_path / "shown.exr", camera_path=path, background="black")
@@ -173,7 +180,7 @@ def test_viewer_of_run_has_cameras(finished_run: Path) -> None:
 
 
 def test_resume_ignores_empty_settings(photographs: Path, finished_run: Path) -> None:
-    run = osp.reconstruct(photographs, finished_run, resume=True, train={}, assignments=[])
+    run = osp.reconstruct(photographs, finished_run, resume=True, train={}, set=[])
     assert run.is_finished
 
 
@@ -196,3 +203,21 @@ def test_scene_is_rendered_from_where_a_photograph_was_taken(finished_run: Path)
     seen = osp.render(run.scene, run.cameras["view_008.png"]).rgb
     stored = read_image(finished_run / "renders" / "view_008.png")[..., :3]
     np.testing.assert_allclose(seen, stored, atol=0.6 / 255)
+
+
+def test_edited_run_is_finished_and_not_measured(in_folder: Path) -> None:
+    osp.crop("run", "half", where="z < 0")
+    half = osp.Run("half")
+    assert half.is_finished and half.psnr is None and repr(half) == "Run('half', not measured)"
+    assert osp.evaluate(half).psnr == half.psnr
+
+
+def test_scene_of_an_unfinished_run_is_refused_with_what_to_do(photographs: Path, tmp_path: Path) -> None:
+    with pytest.raises(osp.CancelledError):
+        osp.reconstruct(photographs, tmp_path / "run", **RUN_OPTIONS, should_stop=lambda: True)
+    run = osp.Run(tmp_path / "run")
+    told = r"holds no scene\.ply yet; finish the run with"
+    with pytest.raises(osp.OctasplatError, match=told):
+        _ = run.scene
+    with pytest.raises(osp.OctasplatError, match=told):
+        osp.crop(run, tmp_path / "a.ply", where="z < 0")

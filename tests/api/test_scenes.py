@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 import octasplat as osp
@@ -71,7 +72,7 @@ def test_what_is_no_picture_is_refused(scene_file: Path) -> None:
             osp.view(scene, open_browser=False, **place)
     for size, fov in (((0, 12), 50.0), ((16, 12), 200.0), ((16, 12), 0.0)):
         with pytest.raises(osp.ConfigError, match=r"must be at least 1|between 0 and 180"):
-            scene.camera(*size, fov=fov)
+            scene.camera(*size, fov_y_degrees=fov)
         with pytest.raises(osp.ConfigError, match=r"must be at least 1|between 0 and 180"):
             osp.Camera.looking_at((0, 0, -4), (0, 0, 0), *size, fov_y_degrees=fov)
 
@@ -119,7 +120,7 @@ def test_picture_shows_the_near_side_of_a_ball(scene_file: Path) -> None:
 def test_results_have_a_page_for_notebooks(scene_file: Path) -> None:
     scene = osp.load(scene_file)
     assert "1,200" in scene._repr_html_()
-    image = osp.render(scene, scene.camera(width=32, height=24))
+    image = osp.render(scene, scene.camera(width_px=32, height_px=24))
     assert image._repr_html_().startswith('<img src="data:image/png;base64,')
     assert image._repr_png_().startswith(b"\x89PNG")
 
@@ -128,7 +129,7 @@ def test_saved_pictures_are_read_back(scene_file: Path, tmp_path: Path) -> None:
     from octasplat.engine.render.image_files import read_image
 
     scene = osp.load(scene_file)
-    image = osp.render(scene, scene.camera(width=32, height=24))
+    image = osp.render(scene, scene.camera(width_px=32, height_px=24))
     found = read_image(image.save(tmp_path / "a.png"))
     np.testing.assert_allclose(found[..., :3], image.rgb, atol=0.5 / 255 + 1e-6)
     assert image.save(tmp_path / "a.exr").stat().st_size > 0
@@ -152,3 +153,59 @@ def test_empty_scene_has_html_repr(scene_file: Path) -> None:
     scene = osp.load(scene_file)
     nothing = scene.select(scene.opacities > 2)
     assert len(nothing) == 0 and "harmonics" in nothing._repr_html_()
+
+
+def test_one_number_selects_one_gaussian(scene_file: Path) -> None:
+    scene = osp.load(scene_file)
+    for index in (7, np.int64(7), [7], np.array([7]), slice(7, 8)):
+        assert np.array_equal(scene.select(index).means, scene.means[7:8])
+    assert len(scene.select(-1)) == 1 and len(scene.select([])) == 0
+    mask = torch.tensor(scene.opacities > 0.5)
+    assert len(scene.select(mask)) == int(mask.sum())  # type: ignore[arg-type]
+
+
+def test_scene_of_tensors_with_gradients_is_that_of_their_values() -> None:
+    """As they are after a training of one's own."""
+    values = {
+        "means": torch.randn(2, 3), "quats": torch.randn(2, 4), "scales": torch.rand(2, 2) + 0.1,
+        "opacities": torch.rand(2), "sh": torch.randn(2, 4, 3),
+    }  # fmt: skip
+    trained = {name: tensor.clone().requires_grad_() for name, tensor in values.items()}
+    scene = osp.Scene.from_arrays(**trained)
+    assert np.array_equal(scene.means, values["means"].numpy())
+    assert np.array_equal(scene.sh, values["sh"].numpy())
+    scene.means = trained["means"] + 1
+    assert np.allclose(scene.means, values["means"].numpy() + 1)
+
+
+@pytest.mark.parametrize("channel", [np.zeros(2), np.zeros((3, 1)), 1.0])
+def test_channels_of_another_shape_are_refused_by_name(channel: Any) -> None:
+    arrays = {"means": np.zeros((2, 3)), "quats": np.ones((2, 4)), "scales": np.ones((2, 2))}
+    with pytest.raises(osp.ConfigError, match=r"^channels: 'metallic' has the shape .*; it must be \(2, f\)"):
+        osp.Scene.from_arrays(
+            **arrays, opacities=np.ones(2), sh=np.zeros((2, 1, 3)), channels={"metallic": channel}
+        )
+
+
+@pytest.mark.parametrize("size", [(64.5, 48), (64.0, 48), ("64", 48), (64, None)])
+def test_sizes_that_are_no_whole_numbers_are_refused(size: Any, scene_file: Path) -> None:
+    scene = osp.load(scene_file)
+    for camera in (lambda: scene.camera(*size), lambda: scene.turntable(2, *size)):
+        with pytest.raises(osp.ConfigError, match=r"^(width|height)_px: must be a whole number of pixels \("):
+            camera()
+    camera = scene.camera(np.int64(8), np.int32(6))  # type: ignore[arg-type]
+    assert osp.render(scene, camera).rgb.shape == (6, 8, 3)
+
+
+def test_threads_below_zero_are_refused(scene_file: Path) -> None:
+    scene = osp.load(scene_file)
+    camera = scene.camera(16, 12)
+    for call in (lambda: osp.render(scene, camera, threads=-1), lambda: osp.trace(scene, camera, threads=-1)):
+        with pytest.raises(osp.ConfigError, match=r"^threads: must be 0"):
+            call()
+
+
+def test_what_is_no_path_is_not_loaded(scene_file: Path) -> None:
+    scene = osp.load(scene_file)
+    with pytest.raises(TypeError, match=r"load takes the path of a file or run, not Scene\("):
+        osp.load(scene)  # type: ignore[arg-type]

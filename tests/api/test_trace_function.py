@@ -163,8 +163,52 @@ def test_scene_tensors_keep_metadata(scene_file: Path) -> None:
     scene = osp.Scene(osp.load(scene_file).gaussians, SceneMetadata(turned_beyond=0.5, near_world=0.1))
     tensors = osp.GaussianTensors.of(scene)
     assert tensors.scene().facts == scene.facts
-    camera = scene.camera(width=48, height=32)
+    camera = scene.camera(width_px=48, height_px=32)
     expected, found = osp.trace(scene, camera), osp.trace(tensors, camera)
     unturned = osp.trace(osp.Scene(scene.gaussians), camera)
     assert not torch.equal(expected.normal, unturned.normal)  # so that it matters
     assert torch.equal(found.normal, expected.normal)
+
+
+GOOD: dict[str, tuple[int, ...]] = {
+    "means": (4, 3), "quats": (4, 4), "log_scales": (4, 2), "opacity_logits": (4,), "sh": (4, 4, 3),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"),
+    [
+        ("means", (4, 4)),
+        ("quats", (5, 4)),
+        ("quats", (3, 4)),
+        ("log_scales", (4, 3)),  # as in 3DGS
+        ("opacity_logits", (4, 1)),
+        ("sh", (4, 3)),
+        ("sh", (4, 5, 3)),
+        ("sh", (3, 4, 3)),
+        ("features", (3, 2)),
+        ("features", (4,)),
+        ("directions", (5, 2)),
+        ("directions", (3,)),
+        ("origins", (4, 3)),
+        ("origins", (3,)),
+        ("origins", (0, 3)),
+    ],
+)
+def test_tensors_of_other_shapes_are_refused_by_name(name: str, shape: tuple[int, ...]) -> None:
+    """The kernels would read beyond them, or other numbers than are meant."""
+    shapes = {**GOOD, "directions": (5, 3), "origins": (1, 3), name: shape}
+    tensors = {each: torch.ones(*size) for each, size in shapes.items()}
+    rays = osp.Rays(tensors.pop("origins"), tensors.pop("directions"))
+    with pytest.raises(osp.ConfigError, match=f"^{name}: has "):
+        osp.trace(osp.GaussianTensors(**tensors), rays)
+
+
+def test_what_is_no_scene_and_no_rays_is_refused(scene_file: Path) -> None:
+    scene = osp.load(scene_file)
+    with pytest.raises(TypeError, match="trace takes Rays or one camera, not tuple"):
+        osp.trace(scene, scene.turntable(2))  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="trace takes a Scene or GaussianTensors, not PosixPath"):
+        osp.trace(scene_file, scene.camera(8, 6))  # type: ignore[arg-type]
+    with pytest.raises(osp.ConfigError, match=r"^directions: must be a tensor of torch, not ndarray"):
+        osp.trace(scene, osp.Rays(torch.zeros(1, 3), np.ones((5, 3))))  # type: ignore[arg-type]

@@ -1,6 +1,7 @@
 """The functions of verbs are those that their requests say."""
 
 import inspect
+import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.events import Event, PhaseProgress, Warned
 from octasplat.engine.operations.base import build_request
 from octasplat.engine.operations.registry import operation, operation_names
+from octasplat.engine.settings.fields import Spelling, Unit
 from octasplat.operation_calls import explicit_values
 
 
@@ -173,11 +175,161 @@ def test_values_of_another_kind_are_refused_in_plain_words(scene_file: Path, tmp
         osp.ConfigError, match=r"^source: must be the path of a file or folder, not a Scene; wr"
     ):
         osp.crop(scene, target, sphere=(0, 0, 0, 1))  # type: ignore[arg-type]
-    with pytest.raises(osp.ConfigError, match=r"^matrix: must be the path of a file or folder, not a list"):
-        osp.transform(scene_file, target, matrix=np.eye(4))  # type: ignore[arg-type]
+    with pytest.raises(osp.ConfigError, match=r"^matrix: must be a 4 x 4 or 3 x 4 matrix of numbers, or"):
+        osp.transform(scene_file, target, matrix=scene)  # type: ignore[arg-type]
     with pytest.raises(osp.ConfigError, match=r"^up: must be a list, not a str"):
         osp.transform(scene_file, target, up="z")  # type: ignore[arg-type]
     with pytest.raises(osp.ConfigError, match=r"^threads: must be 0"):
         osp.crop(scene_file, target, sphere=(0, 0, 0, 1), threads=-1)
     with pytest.raises(TypeError, match="save takes a scene"):
         osp.save(scene_file, target)  # type: ignore[arg-type]
+
+
+def test_matrix_of_numbers_moves_as_that_of_a_file_does(scene_file: Path, tmp_path: Path) -> None:
+    matrix = np.array([[0.0, -2, 0, 1], [2, 0, 0, 2], [0, 0, 2, 3], [0, 0, 0, 1]])
+    np.savetxt(tmp_path / "matrix.txt", matrix)
+    by_file = osp.transform(scene_file, tmp_path / "file.ply", matrix=tmp_path / "matrix.txt")
+    expected = (tmp_path / "file.ply").read_bytes()
+    for number, given in enumerate(
+        (matrix, matrix.astype(np.float32), matrix[:3], matrix.tolist(), tuple(matrix[:3]))
+    ):
+        target = tmp_path / f"{number}.ply"
+        assert osp.transform(scene_file, target, matrix=given).matrix == by_file.matrix
+        assert target.read_bytes() == expected
+
+
+@pytest.mark.parametrize(
+    ("matrix", "sentence"),
+    [
+        (np.eye(3), r"must be a 4 x 4 or 3 x 4 matrix, .* what is given is 3 x 3\.$"),
+        (np.zeros((2, 4, 4)), r"what is given is 2 x 4 x 4\.$"),
+        (np.arange(16), r"what is given is 16\.$"),
+        ([[1, 0, 0, 0], [0, 1, 0]], "must be a 4 x 4 or 3 x 4 matrix of numbers"),
+        ([["a"] * 4] * 4, "must be a 4 x 4 or 3 x 4 matrix of numbers"),
+        (3.0, "what is given is a single number"),
+        (np.full((4, 4), np.nan), "must have finite numbers only"),
+        (np.full((3, 4), np.inf), "must have finite numbers only"),
+        (np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [5, 0, 0, 1]]), "the last row 0 0 0 1"),
+        (np.diag([1.0, 1, 0, 1]), "flattens space"),
+    ],
+)
+def test_what_is_no_affine_matrix_is_refused_in_one_sentence(
+    matrix: Any, sentence: str, scene_file: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(osp.ConfigError, match=sentence) as refused:
+        osp.transform(scene_file, tmp_path / "a.ply", matrix=matrix)
+    assert "\n" not in str(refused.value) and not (tmp_path / "a.ply").exists()
+
+
+def test_sheared_run_says_what_is_lost(in_folder: Path) -> None:
+    """A matrix that is no similarity is taken, by numbers as by a file."""
+    sheared, told = np.eye(4), []
+    sheared[0, 1] = 0.5
+    osp.transform("run", "sheared", matrix=sheared, progress=told.append)
+    assert any(isinstance(event, Warned) and "mirrored, sheared or" in event.message for event in told)
+    osp.transform("run", "moved", matrix=np.diag([2.0, 2, 2, 1]))
+    with pytest.raises(
+        osp.OctasplatError, match=r"moved was moved, and its photographs .* stand where they st"
+    ):
+        osp.evaluate("moved")
+    record = json.loads(Path("sheared/edits.json").read_text())[-1]
+    assert record["matrix"] == sheared.tolist()[:4]
+
+
+def test_merge_takes_a_list_of_all_scenes(in_folder: Path) -> None:
+    osp.crop("scene.ply", "half.ply", where="z < 0")
+    assert osp.merge(["scene.ply", "half.ply"], "two.ply").counts == (1200, 600)
+    assert osp.merge("scene.ply", "same.ply", ["half.ply"]).counts == (1200, 600)
+    assert Path("two.ply").read_bytes() == Path("same.ply").read_bytes()
+    three = osp.merge((Path("scene.ply"), osp.Run("run")), "three.ply", "half.ply")
+    assert three.counts[0] == 1200 and three.counts[2] == 600
+    for few in ([], ["scene.ply"]):
+        with pytest.raises(osp.ConfigError, match="Name at least two scenes"):
+            osp.merge(few, "none.ply")
+    with pytest.raises(osp.ConfigError, match="write the scene to a file first"):
+        osp.merge([osp.load("scene.ply"), osp.load("half.ply")], "none.ply")  # type: ignore[list-item]
+    with pytest.raises(osp.ConfigError, match="would overwrite"):
+        osp.merge(["scene.ply", "half.ply"], "half.ply")
+
+
+def test_settings_by_name_are_those_of_texts() -> None:
+    request = operation("reconstruct").request
+    quat = np.float32(0.25)
+    texts = ["lr.quat=0.25", "test_every=4", "exposure=true", "background=white"]
+    by_name = {"lr.quat": quat, "test_every": np.int64(4), "exposure": True, "background": "white"}
+    configs = [
+        build_request(
+            request, explicit_values(request, {"source": "photos", "output": "out", "set": given})
+        ).config()
+        for given in (texts, tuple(texts), by_name)
+    ]
+    trains = [{"lr.quat": 0.25, "lr": {"mean": 0.5}}, {"lr": {"quat": 0.25, "mean": 0.5}}]
+    by_dots, by_sections = (
+        build_request(request, {"source": "photos", "output": "out", "train": train}) for train in trains
+    )
+    assert by_dots.config() == by_sections.config() and by_dots.requested() == by_sections.requested()
+    assert configs[0] == configs[1] == configs[2]
+    assert configs[0].train.lr.quat == 0.25 and configs[0].test_every == 4
+    alone = explicit_values(request, {"source": "photos", "output": "out", "set": "lr.quat=0.25"})
+    assert build_request(request, alone).config().train.lr.quat == 0.25
+
+
+def test_one_name_has_one_meaning_and_one_unit_in_all_verbs() -> None:
+    """Names of options, of Python and of the fields of jobs are the same; so are their units."""
+    units: dict[str, set[str]] = {}
+    flags: dict[str, set[str]] = {}
+    for name in operation_names():
+        for field, info in operation(name).request.model_fields.items():
+            unit = next((mark.symbol for mark in info.metadata if isinstance(mark, Unit)), "")
+            units.setdefault(field, set()).add(unit)
+            spellings = [mark for mark in info.metadata if isinstance(mark, Spelling)]
+            if any(spelling.hidden for spelling in spellings):
+                continue
+            own = [flag for spelling in spellings for flag in spelling.flags]
+            for flag in own or ["--" + field.replace("_", "-")]:
+                flags.setdefault(flag, set()).add(field)
+    assert {field: found for field, found in units.items() if len(found) > 1} == {}
+    # the mesh that chooses Gaussians, and the edited ones
+    assert {flag: found for flag, found in flags.items() if len(found) > 1} == {"--mesh": {"mesh", "meshes"}}
+    angles = {field for field, found in units.items() if found == {"degrees"}}
+    assert all(field.endswith("_degrees") for field in angles - {"rotate"})  # whose values name the axis, too
+
+
+def test_cameras_of_a_scene_have_the_names_of_all_others(scene_file: Path) -> None:
+    scene, shared = osp.load(scene_file), {"width_px", "height_px", "fov_y_degrees"}
+    for function in (scene.camera, scene.turntable, osp.Camera.looking_at, octasplat.verbs.render):
+        assert shared <= set(inspect.signature(function).parameters)
+    camera = scene.camera(width_px=96, height_px=48, fov_y_degrees=60)
+    assert (camera.width_px, camera.height_px) == (96, 48)
+    assert np.degrees(2 * np.arctan(24 / camera.fy_px)) == pytest.approx(60)
+
+
+def test_too_few_and_too_many_values_are_told_in_plain_words(scene_file: Path, tmp_path: Path) -> None:
+    target = tmp_path / "a.ply"
+    with pytest.raises(
+        osp.ConfigError, match=r"^box\.5: is missing; the 5 values that are given are too few\."
+    ):
+        osp.crop(scene_file, target, box=(0, 0, 0, 1, 1))
+    with pytest.raises(osp.ConfigError, match=r"^sphere: must have at most 4 values, not 5\."):
+        osp.crop(scene_file, target, sphere=(0, 0, 0, 1, 1))
+    with pytest.raises(osp.ConfigError, match=r"^files: must have at least 1 value, not 0\."):
+        osp.export(scene_file, [])
+
+
+def test_name_without_its_unit_is_refused_with_the_whole_name(scene_file: Path, tmp_path: Path) -> None:
+    with pytest.raises(osp.ConfigError, match="render has no option 'fov'; the nearest is fov_y_degrees"):
+        osp.render(scene_file, tmp_path / "a.png", **{"fov": 40})
+
+
+def test_one_size_alone_is_measured(in_folder: Path) -> None:
+    assert set(osp.evaluate("run", scales=2).scales) == {"1/2"}
+
+
+def test_video_and_number_of_frames_mean_a_turntable_of_a_run(in_folder: Path) -> None:
+    size = {"width_px": 32, "height_px": 16}
+    assert osp.render("run", "turn.mp4", frames=2, **size).images == 2
+    assert osp.render("run", "turn", frames=3, **size).images == 3
+    assert osp.render("run", "one.png", look_at=(0, 0, 0), frames=1, **size).images == 1
+    assert osp.render("run", "views").images == 2
+    with pytest.raises(osp.ConfigError, match="a video a turntable or a path of cameras"):
+        osp.render("run", "turn.mp4", views="held-out")

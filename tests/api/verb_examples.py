@@ -80,11 +80,14 @@ True
 >>> import octasplat as osp
 >>> osp.transform("scene.ply", "moved.ply", translate=(0, 0, 1), scale=2).count
 1200
+>>> import numpy as np
+>>> osp.transform("scene.ply", "mirrored.ply", matrix=np.diag([-1, 1, 1, 1])).matrix[0]
+(-1.0, 0.0, 0.0, 0.0)
 """,
     "merge": """
 >>> import octasplat as osp
->>> len(osp.load(osp.merge("scene.ply", "both.ply", ["shiny.ply"]).files[0]))
-2400
+>>> osp.merge(["scene.ply", "shiny.ply"], "both.ply").counts
+(1200, 1200)
 """,
     "clean": """
 >>> import octasplat as osp

@@ -19,7 +19,7 @@ from verb_examples import EXAMPLES
 
 from octasplat.engine.operations.base import Operation
 from octasplat.engine.operations.registry import operations
-from octasplat.engine.settings.fields import Positional, is_negatable
+from octasplat.engine.settings.fields import AlsoSequence, Positional, is_negatable
 
 VERBS = Path(__file__).parents[2] / "src" / "octasplat" / "verbs.py"
 PYTHON_NAMES = {"import": "import_", "stage-init": "stage_init"}
@@ -35,6 +35,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 from pydantic import BaseModel
 
+from octasplat.array_types import Matrix, Numbers
 from octasplat.engine.core.events import EventListener
 from octasplat.engine.operations.base import never_stop
 from octasplat.operation_calls import names_checked, run_operation
@@ -85,6 +86,10 @@ def _one(annotation: Any) -> str:
         return f"Literal[{', '.join(map(_quoted, arguments))}]"
     if origin in (tuple, list, set, frozenset):
         inner = sorted({type_text(argument) for argument in arguments if argument is not Ellipsis})
+        if inner == ["float"]:
+            return "Numbers"
+        if inner == ["Numbers"]:
+            return "Matrix"
         # One value alone may stand where any number may be given.
         alone = " | PathLike" if Ellipsis in arguments and inner == ["PathLike"] else ""
         return f"Sequence[{' | '.join(inner)}]{alone}"
@@ -118,6 +123,8 @@ def _parameters(fields: dict[str, FieldInfo]) -> Iterator[tuple[str, str, bool]]
     for name, info in fields.items():
         text = type_text(info.annotation, tuple(info.metadata))
         places = name == "output" or any(isinstance(mark, Positional) for mark in info.metadata)
+        if any(isinstance(mark, AlsoSequence) for mark in info.metadata):
+            text = f"Sequence[{text}] | {text}"
         if info.is_required():
             yield name, f"{name}: {text}", places
             continue

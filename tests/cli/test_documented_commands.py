@@ -34,7 +34,7 @@ FIRST = {"README.md", "docs/first_scene.md"}
 """Pages that a new user reads first, whose trainings run daily."""
 TRAINING = {"demo", "reconstruct", "surface"}
 PHOTOGRAPHS = (
-    "SCENE", "SCENE/test", "PHOTOS", "PHOTOGRAPHS", "SITE", "fox", "shiny_knot", "shiny_knot/test",
+    "PHOTOS", "PHOTOS/test", "PHOTOGRAPHS", "SITE", "fox", "shiny_knot", "shiny_knot/test",
     "still_life",
 )  # fmt: skip
 RUNS = ("OUT", "out")
@@ -149,19 +149,19 @@ def add_scenes(folder: Path, run: Path, words: Sequence[str]) -> None:
     for name in ("edited.ply", "part.ply", "frames/0.ply", "frames/1.ply"):
         shutil.copy(run / "mesh.ply", folder / name)
     if any(word.startswith("OUT/poses/") for word in words):  # as a search finds them in more photographs
-        write_found_poses(folder / "SCENE", folder / "OUT" / "poses")
+        write_found_poses(folder / "PHOTOS", folder / "OUT" / "poses")
     if any(word.startswith("THINGS/") for word in words):  # of a benchmark, which takes minutes
-        shutil.copytree(folder / "SCENE", folder / "THINGS" / "kettle")
+        shutil.copytree(folder / "PHOTOS", folder / "THINGS" / "kettle")
     mask = np.zeros((36, 48, 3), np.float32)
     mask[6:30, 8:40] = 1
     if "--masks" in words:
-        (folder / "SCENE" / "masks").mkdir()
-        for photograph in (folder / "SCENE" / "images").iterdir():
-            write_png(folder / "SCENE" / "masks" / f"{photograph.name}.png", mask)
+        (folder / "PHOTOS" / "masks").mkdir()
+        for photograph in (folder / "PHOTOS" / "images").iterdir():
+            write_png(folder / "PHOTOS" / "masks" / f"{photograph.name}.png", mask)
     if "--mask" in words:
         write_png(folder / words[words.index("--mask") + 1], mask)
     if words[-2:] == ["--georeference", "gps"] or "--control-points" in words:
-        write_places(folder / "SCENE")
+        write_places(folder / "PHOTOS")
     if "-o" in words:
         remove(folder / words[words.index("-o") + 1])
 

@@ -30,9 +30,7 @@ def test_estimate_counts_photographs_and_follows_the_options(photographs: Path) 
     assert fast.cores == 2 and fast.finds_poses and "find the poses" in fast.text
     assert 0 < fast.poses_seconds < fast.seconds
     assert fast.cpu_seconds < standard.cpu_seconds
-    longer = run(
-        EstimateRequest(source=photographs, preset="fast", cores=2, assignments=("iterations=5000",))
-    )
+    longer = run(EstimateRequest(source=photographs, preset="fast", cores=2, set=("iterations=5000",)))
     assert longer.cpu_seconds > fast.cpu_seconds
 
 

@@ -31,7 +31,7 @@ def changed(shiny_run, octasplat, tmp_path_factory) -> Path:
     output = tmp_path_factory.mktemp("changed") / "run"
     done = octasplat(
         "material", shiny_run, "-o", output, "--set", "albedo=#ff8000", "--set", "metallic=0",
-        "--scale", "roughness=1.5", "--where", "x > 0 and roughness < 0.6",
+        "--multiply", "roughness=1.5", "--where", "x > 0 and roughness < 0.6",
     )  # fmt: skip
     assert done.exit_code == 0, done.output
     count = int((scene_of(shiny_run).means_world[:, 0] > 0).sum())
@@ -79,7 +79,7 @@ def test_material_output_folder_is_a_run(shiny_run, changed, octasplat, tmp_path
 def test_material_job_matches_command_bytes(shiny_run, changed, tmp_path):
     shutil.copytree(shiny_run, tmp_path / "attempt" / "run")
     asked = {
-        "set": {"albedo": "#ff8000", "metallic": 0}, "scale": {"roughness": 1.5},
+        "set": {"albedo": "#ff8000", "metallic": 0}, "multiply": {"roughness": 1.5},
         "where": "x > 0 and roughness < 0.6",
     }  # fmt: skip
     options = get_job_kind("material").resolve(asked)
@@ -186,7 +186,7 @@ def test_material_mask_selects_visible_gaussians(shiny_run, octasplat, tmp_path)
         (("shiny.ply", "--set", "roughness=2"), "--set roughness: "),
         (("shiny.ply", "--set", "roughness"), "NAME=VALUE"),
         (("shiny.ply", "--set", "albedo=red"), "--set albedo: write it as r,g,b"),
-        (("shiny.ply", "--scale", "metallic=-1"), "--scale metallic: "),
+        (("shiny.ply", "--multiply", "metallic=-1"), "--multiply metallic: "),
         (("shiny.ply", "--set", "metallic=1", "--where", "glow > 1"), "the scene has no glow"),
         (("shiny.ply", "--set", "metallic=1", "--where", "x >"), "--where: 'x >' is no expression"),
         (("shiny.ply", "--set", "metallic=1", "--where", "x > 1e6"), "none of its"),
@@ -209,7 +209,7 @@ def test_material_invalid_arguments_print_one_sentence(
     ("arguments", "told"),
     [
         ((), "Say what to change"),
-        (("--set", "metallic=1", "--scale", "metallic=2"), "metallic is set and scaled"),
+        (("--set", "metallic=1", "--multiply", "metallic=2"), "metallic is set and multiplied"),
     ],
 )
 def test_material_without_change_is_usage_error(shiny_run, octasplat, tmp_path, arguments, told):

@@ -67,7 +67,31 @@ def test_all_truncated_photographs_are_named_at_once(noise, octasplat, tmp_path,
         (noise / name).write_bytes(whole[: len(whole) // 2])
     refused = octasplat("reconstruct", noise, "-o", tmp_path / "out", *tiny)
     assert refused.exit_code == 1
-    assert f"2 photographs of {noise} are damaged or cut short (1.jpg, 3.jpg); replace" in refused.stderr
+    assert f"2 images in {noise} are damaged, cut short or none at all (1.jpg, 3.jpg);" in refused.stderr
+    assert "replace the files, or take them out of the folder." in refused.stderr
+
+
+@pytest.mark.parametrize("command", ["reconstruct", "estimate"])
+def test_all_damaged_photographs_of_a_model_are_named_at_once(posed_copy, octasplat, tmp_path, tiny, command):
+    """Those that are no images, and for a training those that end early."""
+    names = sorted(path.name for path in (posed_copy / "images").iterdir())
+    for name in names[:2]:
+        whole = (posed_copy / "images" / name).read_bytes()
+        (posed_copy / "images" / name).write_bytes(whole[: len(whole) // 2])
+    output = ("-o", tmp_path / "out") if command == "reconstruct" else ()
+    if command == "reconstruct":
+        refused = octasplat(command, posed_copy, *output, *tiny)
+        assert refused.exit_code == 1 and refused.stderr.count("Error") == 1
+        told = f"2 images in {posed_copy} are damaged, cut short or none at all (images/{names[0]}, images/"
+        assert f"Error: {told}{names[1]}); replace the files." in refused.stderr
+        assert not (tmp_path / "out" / "config.json").exists()
+    for name in names[3:5]:
+        (posed_copy / "images" / name).write_bytes(b"no image")
+    refused = octasplat(command, posed_copy, *output, *(tiny if output else ()))
+    found = names[:2] + names[3:5] if command == "reconstruct" else names[3:5]
+    assert refused.exit_code == 1
+    assert f"{len(found)} images in {posed_copy}" in refused.stderr
+    assert all(name in refused.stderr for name in found) and names[2] not in refused.stderr
 
 
 def test_missing_masks_are_refused_before_pose_search(noise, octasplat, tmp_path, tiny):

@@ -158,7 +158,7 @@ def test_settings_resolve_equally_in_cli_job_and_api(
     monkeypatch: pytest.MonkeyPatch, asked: tuple[str, bool, list[str]]
 ) -> None:
     preset, materials, given_ = asked
-    options = {"preset": preset, "materials": materials, "assignments": given_}
+    options = {"preset": preset, "materials": materials, "set": given_}
     expected = by_python(options)
     assert by_command(preset, materials, given_, monkeypatch) == expected
     assert by_submit(preset, materials, given_, monkeypatch) == expected
@@ -192,8 +192,8 @@ def _nested(preset: str, materials: bool, given: list[str]) -> dict[str, Any]:
     [
         {"materials": True},
         {"train": {"materials": {"learn": True}}},
-        {"assignments": ["materials.learn=true"]},
-        {"assignments": ["train.materials.learn=1"]},
+        {"set": ["materials.learn=true"]},
+        {"set": ["train.materials.learn=1"]},
     ],
 )
 def test_materials_settings_resolve_equally_in_all_spellings(options: dict[str, Any]) -> None:
@@ -207,7 +207,7 @@ def test_materials_settings_resolve_equally_in_all_spellings(options: dict[str, 
 @pytest.mark.parametrize("recipe", ["near_field", "ref_gaussian"])
 def test_short_training_by_other_recipe_has_steps_of_its_own(recipe: str) -> None:
     """However the recipe is told, and whether at once or of a configuration that is there."""
-    at_once = by_python({"preset": "fast", "materials": True, "assignments": [f"materials.recipe={recipe}"]})
+    at_once = by_python({"preset": "fast", "materials": True, "set": [f"materials.recipe={recipe}"]})
     assert isinstance(at_once, ReconstructionConfig)
     assert (at_once.train.sh_degree, at_once.train.lr.quat, at_once.train.loss.edges) == (1, 1e-3, None)
     assert (
@@ -224,7 +224,7 @@ def test_short_training_by_other_recipe_has_steps_of_its_own(recipe: str) -> Non
 
 
 def test_paper_preset_with_materials_is_refused() -> None:
-    refused = by_python({"preset": "redisplats", "assignments": ["materials.learn=true"]})
+    refused = by_python({"preset": "redisplats", "set": ["materials.learn=true"]})
     assert refused == (
         "The preset redisplats is for scenes without materials; with materials choose fast, standard or high."
     )
@@ -246,15 +246,13 @@ def test_paper_preset_with_materials_is_refused() -> None:
     ],
 )
 def test_unusable_settings_are_refused_with_reason(assignment: str, sentence: str) -> None:
-    assert by_python({"assignments": ["refine_poses=true", assignment]}) == sentence
+    assert by_python({"set": ["refine_poses=true", assignment]}) == sentence
 
 
 def test_options_of_previous_version_are_kept() -> None:
     kind = get_job_kind("reconstruct")
     before = (
-        ReconstructOptions(preset="standard", assignments=("rays_per_batch=4096",))
-        .config()
-        .model_dump(mode="json")
+        ReconstructOptions(preset="standard", set=("rays_per_batch=4096",)).config().model_dump(mode="json")
     )
     before["train"]["trace"]["t_min"] = 0.0  # a constant by now
     before["poses"] = "given"
@@ -272,11 +270,9 @@ def test_options_of_previous_version_are_kept() -> None:
 
 def test_retry_with_materials_adds_their_settings() -> None:
     kind = get_job_kind("reconstruct")
-    before = ReconstructOptions(preset="fast", assignments=("rays_per_batch=4096", "seed=7")).config()
+    before = ReconstructOptions(preset="fast", set=("rays_per_batch=4096", "seed=7")).config()
     changed = kind.revise(before.model_dump(mode="json"), {"materials": True})
-    wanted = ReconstructOptions(
-        preset="fast", materials=True, assignments=("rays_per_batch=4096", "seed=7")
-    ).config()
+    wanted = ReconstructOptions(preset="fast", materials=True, set=("rays_per_batch=4096", "seed=7")).config()
     assert changed.run_config() == wanted
     back = kind.revise(changed.model_dump(mode="json"), {"train": {"materials": {"learn": False}}})
     assert back.run_config() == before

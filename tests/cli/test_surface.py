@@ -29,7 +29,7 @@ def test_run_to_each_format(run, octasplat, tmp_path):
 def test_surface_all_options_write_textured_obj(run, octasplat, tmp_path):
     result = octasplat(
         "surface", run.output / "scene.ply", "--dataset", run.scene, "-o", tmp_path / "new" / "a.obj", *SMALL,
-        "--bounds", "-1,-1,-0.5,1,1,1", "--components", 1, "--fill-holes", "all", "--max-triangles", 500,
+        "--box", -1, -1, -0.5, 1, 1, 1, "--keep-components", 1, "--fill-holes", "all", "--max-triangles", 500,
         "--texture-size", 128, "--threads", 1,
     )  # fmt: skip
     assert result.exit_code == 0, result.output
@@ -124,10 +124,10 @@ def test_surface_of_file_uses_surrounding_cameras(run, octasplat, tmp_path):
     [
         (("-o", "a.stl"), "written as .glb, .ply, .obj or .usdz"),
         (("-o", "a.ply", "--texture-size", 128), "holds no texture"),
-        (("-o", "a.glb", "--unbounded", "--bounds", "0,0,0,1,1,1"), "contradict"),
+        (("-o", "a.glb", "--unbounded", "--box", 0, 0, 0, 1, 1, 1), "contradict"),
         (("-o", "a.glb", "--voxel", "0.1", "--resolution", "64"), "give one of them"),
-        (("-o", "a.glb", "--bounds", "0,0,0,1,1,0"), "x0 < x1"),
-        (("-o", "a.glb", "--bounds", "90,90,90,91,91,91"), "--bounds"),
+        (("-o", "a.glb", "--box", 0, 0, 0, 1, 1, 0), "x0 < x1"),
+        (("-o", "a.glb", "--box", 90, 90, 90, 91, 91, 91), "--box"),
         (("-o", "a.glb", "--max-memory", "0.0001"), "allowed"),
         (("-o", "a.glb", "--dataset", "nowhere"), "nowhere"),
     ],
@@ -144,7 +144,6 @@ def test_refusals_are_one_sentence(run, octasplat, tmp_path, monkeypatch, option
 @pytest.mark.parametrize(
     "bad",
     [
-        ("--bounds", "1,2,3"),
         ("--fill-holes", "some"),
         ("--fill-holes", "-1"),
         ("--max-triangles", "5q"),

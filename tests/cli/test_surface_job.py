@@ -100,7 +100,6 @@ def test_materials_bring_their_light(shiny_run, octasplat, tmp_path):
 @pytest.mark.parametrize(
     ("name", "flag", "text", "value"),
     [
-        ("bounds", "--bounds", "1,2,3", [1, 2, 3, 4, 5, 6.5]),
         ("fill_holes", "--fill-holes", "some", "all"),
         ("fill_holes", "--fill-holes", "-1", 3.5),
         ("max_triangles", "--max-triangles", "5q", ["5k", "60000"]),
@@ -128,9 +127,9 @@ def test_surface_job_presets_fill_unset_options():
     assert lit.texture_size == MATERIAL_DEFAULTS["texture_size"] and dict(lit.levels) == {"5k": 5000}
     plain = SURFACE.revise(room.model_dump(mode="json"), {"room": False})
     assert plain == SURFACE.resolve({"resolution": 99})
-    boxed = SURFACE.resolve({"room": True, "bounds": "0,0,0,1,1,1"})
+    boxed = SURFACE.resolve({"room": True, "box": [0, 0, 0, 1, 1, 1]})
     assert not boxed.unbounded and boxed.resolution == ROOM_DEFAULTS["resolution"]
-    assert SURFACE.revise(boxed.model_dump(mode="json"), {"bounds": None}) == SURFACE.resolve({"room": True})
+    assert SURFACE.revise(boxed.model_dump(mode="json"), {"box": None}) == SURFACE.resolve({"room": True})
     request = SurfaceRequest(source="a.ply", output="b.glb", room=True, max_triangles=("5k", "60000"))
     assert request.refine_vertices and [path.name for path in request.outputs] == ["b_5k.glb", "b_60000.glb"]
 
@@ -146,9 +145,9 @@ def test_surface_job_color_fit_needs_photographs():
         ({"format": "ply", "texture_size": 128}, "a PLY holds no texture"),
         ({"format": "obj", "materials": True}, "materials are written as .glb"),
         ({"up": "z"}, "up: goes with materials"),
-        ({"unbounded": True, "bounds": "0,0,0,1,1,1"}, "contradict"),
+        ({"unbounded": True, "box": [0, 0, 0, 1, 1, 1]}, "contradict"),
         ({"voxel": 0.1, "resolution": 64}, "give one of them"),
-        ({"bounds": "0,0,0,1,1,0"}, "z0 < z1"),
+        ({"box": [0, 0, 0, 1, 1, 0]}, "z0 < z1"),
     ],
 )
 def test_surface_job_contradictory_options_are_refused(options, told):

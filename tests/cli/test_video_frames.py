@@ -77,7 +77,7 @@ def test_what_is_no_video_is_refused(tmp_path: Path) -> None:
 
 
 def test_reconstruction_takes_the_frames_beside_its_output(clip: Path, tmp_path: Path) -> None:
-    request = ReconstructRequest(source=clip, output=tmp_path / "run", frames_per_second=1)
+    request = ReconstructRequest(source=clip, output=tmp_path / "run", fps=1)
     assert scene_folder(request) == tmp_path / "run-frames"
     notes: list[str] = []
     with pytest.raises(DatasetError):  # three flat pictures have no poses
@@ -87,7 +87,7 @@ def test_reconstruction_takes_the_frames_beside_its_output(clip: Path, tmp_path:
 
 
 def test_estimate_counts_the_frames_that_would_be_taken(octasplat, clip: Path) -> None:
-    asked = octasplat("estimate", clip, "--frames-per-second", "2", "--preset", "fast", "--json")
+    asked = octasplat("estimate", clip, "--fps", "2", "--preset", "fast", "--json")
     assert asked.exit_code == 0, asked.stderr
     found = json.loads(asked.stdout)
     assert found["photographs"] == [{"width_px": 96, "height_px": 64, "count": 2 * SECONDS}]

@@ -199,8 +199,8 @@ def test_surface_of_a_far_scene_is_that_at_the_origin(
     meshes = []
     for name, origin in (("near", NO_ORIGIN), ("far", ORIGIN)):
         site = Site(tmp_path / name, scene, origin)
-        bounds = ",".join(map(str, (*site.place(-1.6, -1.6, -1.6), *site.place(1.6, 1.6, 0.4))))
-        options = ("--resolution", 20, "--depth-side", 96, "--no-fit", "--bounds", bounds)
+        box = (*site.place(-1.6, -1.6, -1.6), *site.place(1.6, 1.6, 0.4))
+        options = ("--resolution", 20, "--depth-side", 96, "--no-fit", "--box", *box)
         run(octasplat, "surface", site.scene, "-o", site.folder / "surface.ply", *options)
         meshes.append(read_mesh(site.folder / "surface.ply").about(tuple(site.origin)))
     assert len(meshes[0].vertices) > 50

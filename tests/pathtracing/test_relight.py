@@ -116,8 +116,8 @@ def test_options_of_the_other_integrator_are_named() -> None:
 def test_relight_rotated_environment_equals_rotated_map(scene, tmp_path, by, least):
     for name, environment, turn in (("a", "turned.exr", 0), ("b", "sides.exr", 180), ("c", "sides.exr", 0)):
         done = relight(
-            scene / "ball.ply", "--environment", scene / environment, "--rotate", turn, "-o", tmp_path / name,
-            "--integrator", by, *SMALL,
+            scene / "ball.ply", "--environment", scene / environment, "--rotation", turn,
+            "-o", tmp_path / name, "--integrator", by, *SMALL,
         )  # fmt: skip
         assert done.exit_code == 0, done.output
     a, b, c = (read_image(tmp_path / name / "frame_0000.png") for name in "abc")

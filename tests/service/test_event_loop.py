@@ -55,10 +55,10 @@ SHAPES: dict[str, Callable[[], bytes]] = {
         render(mode="path", camera_path={"keyframes": [{"position": [1, 2, 3]}] * 9000})
     ).encode(),
     "assignments": lambda: json.dumps(
-        {"kind": "reconstruct", "options": {"assignments": ["lr.mean=0.001"] * 49_000}}
+        {"kind": "reconstruct", "options": {"set": ["lr.mean=0.001"] * 49_000}}
     ).encode(),
     "as many assignments as are allowed": lambda: json.dumps(
-        {"kind": "reconstruct", "options": {"assignments": ["lr.mean=0.001"] * 1000}}
+        {"kind": "reconstruct", "options": {"set": ["lr.mean=0.001"] * 1000}}
     ).encode(),
     "photographs": lambda: json.dumps(
         {"kind": "reconstruct", "photographs": [{"width_px": 9, "height_px": 9, "count": 1}] * 12_000}

@@ -242,7 +242,7 @@ async def test_jobs_give_the_scenes_of_the_commands(
         assert await jobs.read(export, "b.glb") == (tmp_path / "b.glb").read_bytes()
 
         splat = (tmp_path / "a.splat").read_bytes()
-        imported = await jobs.make("import", {"file": "a.splat"}, None, a__splat=splat)
+        imported = await jobs.make("import", {"source": "a.splat"}, None, a__splat=splat)
         assert await jobs.read(imported, "scene.ply") == (tmp_path / "imported.ply").read_bytes()
         part = await jobs.make("crop", {"where": "x > 0"}, imported)  # a bare scene gives a bare scene
         assert await jobs.names(part) == {"scene.ply"}

@@ -69,11 +69,11 @@ def test_scene_at_an_address_is_fetched_checked_and_queued(
         with osp.Client(front.address, front.token) as client:
             digest = hashlib.sha256(ARCHIVE).hexdigest()
             Elsewhere.asked.clear()
-            ids = {client.import_scene(url, sha256=digest) for _ in range(2)}
+            ids = {client.import_dataset(url, sha256=digest) for _ in range(2)}
             assert len(ids) == 1 and Elsewhere.asked == ["/fox.zip?key=1"]
-            assert client.import_scene(url, sha256=None) not in ids
+            assert client.import_dataset(url, sha256=None) not in ids
             with Api(front.address, front.token) as api:
                 api.request("DELETE", f"/v1/datasets/{ids.pop()}")
-            assert client.import_scene(url, sha256=digest) == client.import_scene(url, sha256=digest)
+            assert client.import_dataset(url, sha256=digest) == client.import_dataset(url, sha256=digest)
             with pytest.raises(ServiceError, match="SHA-256"):
-                client.import_scene(url, sha256="0" * 64)
+                client.import_dataset(url, sha256="0" * 64)

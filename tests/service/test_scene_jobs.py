@@ -17,11 +17,11 @@ async def test_scene_job_invalid_options_are_refused_before_queueing(conninfo: s
         files = await sent(http, {"a.ply": b"ply\n", "sky.hdr": HDR, "turn.txt": b"1 0 0 0"})
         on = {"source_id": source, "files_id": files}
         for body, pointer, words in (
-            ({"kind": "import", "options": {"file": "a.ply"}}, "#/files_id", "works on files_id"),
-            ({"kind": "import", "options": {"file": "a.ply"}, **on}, "#/source_id", "files_id alone"),
+            ({"kind": "import", "options": {"source": "a.ply"}}, "#/files_id", "works on files_id"),
+            ({"kind": "import", "options": {"source": "a.ply"}, **on}, "#/source_id", "files_id alone"),
             (
-                {"kind": "import", "options": {"file": "b.ply"}, "files_id": files},
-                "#/options/file",
+                {"kind": "import", "options": {"source": "b.ply"}, "files_id": files},
+                "#/options/source",
                 "there is no file 'b.ply'",
             ),
             ({"kind": "edit", "options": {}, **on}, "#/options/meshes", "required"),

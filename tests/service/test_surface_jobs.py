@@ -11,7 +11,6 @@ from tests.support.service_harness import running_service
 
 async def test_options_are_refused_with_the_sentence_of_the_command(conninfo: str, tmp_path: Path) -> None:
     cases = (
-        ("surface", "bounds", "--bounds", "1,2"),
         ("surface", "fill_holes", "--fill-holes", "some"),
         ("surface", "max_triangles", "--max-triangles", "5k,5000"),
         ("evaluate", "scales", "--scales", "2,zero"),

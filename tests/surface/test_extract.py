@@ -166,6 +166,6 @@ def test_surface_default_cameras_cover_ball(ball, tracer, tmp_path):
 
 def test_surface_contradictory_options_are_refused():
     with pytest.raises(ValueError, match="contradict"):
-        ExtractionOptions(unbounded=True, bounds=(0, 0, 0, 1, 1, 1))
+        ExtractionOptions(unbounded=True, box=(0, 0, 0, 1, 1, 1))
     with pytest.raises(ValueError, match="x0 < x1"):
-        ExtractionOptions(bounds=(0, 0, 0, 1, -1, 1))
+        ExtractionOptions(box=(0, 0, 0, 1, -1, 1))

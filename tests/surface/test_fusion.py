@@ -58,7 +58,7 @@ def test_region_is_visible_volume():
 
 
 def test_box_and_voxel_are_kept():
-    mesh, region = mesh_of(sphere_maps(), bounds=(-2, -2, 0.25, 2, 2, 2), voxel=0.05)
+    mesh, region = mesh_of(sphere_maps(), box=(-2, -2, 0.25, 2, 2, 2), voxel=0.05)
     assert region.voxel_world == 0.05
     assert mesh.vertices_world[:, 2].min() > 0.25
     assert edge_report(mesh.faces).open_edges > 50  # cut off by the box
@@ -116,8 +116,8 @@ def test_fusion_unknown_depth_leaves_hole():
 def test_fusion_is_independent_of_view_order():
     maps = sphere_maps(count=12)
     turned = DepthMaps(maps.cameras[::-1], maps.distances[::-1], maps.cosines[::-1])
-    one, _ = mesh_of(maps, bounds=(-1.5,) * 3 + (1.5,) * 3, resolution=48)
-    two, _ = mesh_of(turned, bounds=(-1.5,) * 3 + (1.5,) * 3, resolution=48)
+    one, _ = mesh_of(maps, box=(-1.5,) * 3 + (1.5,) * 3, resolution=48)
+    two, _ = mesh_of(turned, box=(-1.5,) * 3 + (1.5,) * 3, resolution=48)
     np.testing.assert_array_equal(one.faces, two.faces)
     np.testing.assert_allclose(one.vertices_world, two.vertices_world, atol=1e-5)
 
@@ -126,8 +126,8 @@ def test_fusion_refusals_name_remedy():
     maps = sphere_maps(count=4)
     with pytest.raises(ConfigError, match="allowed"):
         mesh_of(maps, resolution=64, max_memory_gb=1e-4)
-    with pytest.raises(ConfigError, match="--bounds"):
-        mesh_of(maps, bounds=(10, 10, 10, 11, 11, 11))
+    with pytest.raises(ConfigError, match="--box"):
+        mesh_of(maps, box=(10, 10, 10, 11, 11, 11))
     with pytest.raises(ConfigError, match="larger voxels"):
         mesh_of(maps, voxel=1e-5)
     with pytest.raises(ConfigError, match="no common centre"):

@@ -16,7 +16,7 @@ from tests.support.tiny_dataset import make_tiny_dataset
 from tests.support.unexplained_photographs import patched_trials
 
 FEW = ["iterations=2", "initial_points=50", "max_gaussians=100", "test_every=4"]
-OPTIONS: dict[str, Any] = {"preset": "fast", "exports": [], "assignments": FEW, "threads": 1}
+OPTIONS: dict[str, Any] = {"preset": "fast", "exports": [], "set": FEW, "threads": 1}
 LIKE_MATERIALS: dict[str, Any] = {"rays_per_batch": 8192}
 """What materials bring anyway, and the preset without them does not."""
 
@@ -115,6 +115,6 @@ def test_photographs_elsewhere_leave_what_was_given(scene: Path, tmp_path: Path)
 
 
 def test_materials_are_learnt_where_what_was_given_needs_them(scene: Path, tmp_path: Path) -> None:
-    options = {**OPTIONS, "assignments": [*FEW, "ray_patch_rays=1"], "for_surface": True}
+    options = {**OPTIONS, "set": [*FEW, "ray_patch_rays=1"], "for_surface": True}
     run = osp.reconstruct(scene, tmp_path / "run", **options, materials=True)
     assert run.settings["train"]["materials"]["learn"] is True

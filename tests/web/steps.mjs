@@ -721,7 +721,7 @@ const steps = {
         await page.goto(`${job.url}/jobs/${job.job}`);
         await page.click("form[data-kind=material] >> xpath=ancestor::details >> summary");
         await page.fill("#material-set-albedo", "#ff8000");
-        await page.fill("#material-scale-roughness", "0.5");
+        await page.fill("#material-multiply-roughness", "0.5");
         await page.fill("#material-where", "metallic > 0.5");
         await shot(page, "material_form");
         await page.click("form[data-kind=material] [type=submit]");

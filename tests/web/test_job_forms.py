@@ -68,7 +68,7 @@ def test_job_kinds_have_form_pages(pages: Callable[..., tuple[str, str]]) -> Non
 def test_form_asks_for_files_named_by_options(pages: Callable[..., tuple[str, str]]) -> None:
     job, new = pages(*RESULTS)
     assert 'type="file" multiple required data-path="meshes"' in job
-    assert 'type="file" required data-path="file"' in new
+    assert 'type="file" required data-path="source"' in new
 
 
 def test_scene_opens_in_the_viewer(pages: Callable[..., tuple[str, str]]) -> None:

@@ -101,7 +101,7 @@ def test_materials_page_offers_layers_relight_and_edit(
     assert film["files_id"] == relit["files_id"] and found["maps"] == ["A file of yours", "a_map.hdr (light)"]
     assert film["options"]["spin"] and film["options"]["mode"] == "turntable"
     assert changed["kind"] == "material" and changed["options"]["where"] == "metallic > 0.5"
-    assert changed["options"]["set"]["albedo"][0] == 1 and changed["options"]["scale"]["roughness"] == 0.5
+    assert changed["options"]["set"]["albedo"][0] == 1 and changed["options"]["multiply"]["roughness"] == 0.5
     assert found["nameless"] == [] and found["overflow"] <= 0 and found["complaints"] == []
 
 

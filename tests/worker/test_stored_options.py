@@ -75,7 +75,7 @@ RECONSTRUCTIONS: list[tuple[dict[str, Any], dict[str, Any]]] = [
         {"for_surface": True, "train": {"materials": {"learn": False}}},
     ),
     (
-        {"iterations": 300, "assignments": ["lr.mean=0.001", "test_every=4"]},
+        {"iterations": 300, "set": ["lr.mean=0.001", "test_every=4"]},
         {"test_every": 4, "train": {"iterations": 300, "lr": {"mean": 0.001}}},
     ),
     ({"rays": 512}, {"train": {"rays_per_batch": 512}}),

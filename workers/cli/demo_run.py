@@ -59,7 +59,7 @@ def reconstruct_demo_scene(
         output=output,
         resume=resume,
         preset=preset,
-        assignments=DEMO_ASSIGNMENTS.get(preset, ()),
+        set=DEMO_ASSIGNMENTS.get(preset, ()),
     )
     config = request.config().with_poses_decided(has_model=True)
     if resume and read_config(output / CONFIG).with_poses_decided(has_model=True) != config:

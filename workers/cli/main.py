@@ -65,7 +65,7 @@ _SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
     },
     "Work with a service": {
         "open": ("open", "Sign a browser in to the service."),
-        "submit": ("submit", "Send a scene to the service and queue its reconstruction."),
+        "submit": ("submit", "Send photographs to the service and queue their reconstruction."),
         "derive": ("submit", "Queue a job on the results of a finished one, such as a render."),
         "jobs": ("service_jobs", "List jobs."),
         "status": ("service_jobs", "Show a job, or wait for it."),

@@ -37,7 +37,8 @@ def click_type(annotation: Any, info: FieldInfo | None) -> Any:
         marks += more
     if values := _literal_values(annotation):
         return ValueChoice(values)
-    if annotation is Path:
+    # of what Python takes in other ways, too, a command takes the file
+    if annotation is Path or (_is_union(annotation) and any(map(_is_path, get_args(annotation)))):
         return click.Path(path_type=Path)
     if annotation in (int, float):
         return _number_range(annotation, marks)
@@ -48,10 +49,18 @@ def _literal_values(annotation: Any) -> tuple[Any, ...]:
     """Return the values of a literal type, or of a union of such; none where it is something else."""
     if get_origin(annotation) is Literal:
         return get_args(annotation)
-    if get_origin(annotation) in (Union, types.UnionType):
+    if _is_union(annotation):
         parts = [_literal_values(part) for part in get_args(annotation) if part is not type(None)]
         return tuple(value for part in parts for value in part) if all(parts) else ()
     return ()
+
+
+def _is_union(annotation: Any) -> bool:
+    return get_origin(annotation) in (Union, types.UnionType)
+
+
+def _is_path(annotation: Any) -> bool:
+    return strip_optional(annotation)[0] is Path
 
 
 def plain_click_type(annotation: Any) -> Any:
@@ -85,7 +94,7 @@ def strip_optional(annotation: Any) -> tuple[Any, bool]:
     """Return the annotation without None and marks, and whether None was in it."""
     if get_origin(annotation) is Annotated:
         return strip_optional(get_args(annotation)[0])
-    if get_origin(annotation) in (Union, types.UnionType):
+    if _is_union(annotation):
         parts = [part for part in get_args(annotation) if part is not type(None)]
         if len(parts) == 1:
             inner, _ = strip_optional(parts[0])

@@ -44,7 +44,6 @@ def set_option(command: F) -> F:
     """Add the option ``--set`` to a command."""
     return click.option(
         "--set",
-        "assignments",
         multiple=True,
         metavar="NAME=VALUE",
         help="An option of the job's kind, or of a reconstruction any setting, e.g. lr.quat=0.02, values as "

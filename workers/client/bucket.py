@@ -19,7 +19,7 @@ from octasplat.workers.client.dataset_files import ProgressCounter, keep_files
 from octasplat.workers.client.dataset_tasks import (
     create_dataset_once,
     fill_and_commit,
-    import_scene,
+    import_dataset,
     wait_for_task,
 )
 from octasplat.workers.client.upload import preview_files
@@ -219,7 +219,7 @@ def import_bucket(
             # The address of the same file is another one each time that it is signed.
             version = f"{bucket.place}\n{file.size_bytes}\n{file.etag}"
             url = bucket.file_address(file.key)
-            return import_scene(api, url, name=name, sha256=sha256, version=version)
+            return import_dataset(api, url, name=name, sha256=sha256, version=version)
         if sha256 is not None:
             raise ConfigError("A digest goes with a ZIP file, not with a folder of a bucket.")
         return _import_folder(api, bucket, name, progress, on_warning)

@@ -113,7 +113,7 @@ def is_web_address(scene: object) -> bool:
     return isinstance(scene, str) and scene.startswith(("https://", "http://"))
 
 
-def import_scene(
+def import_dataset(
     api: Api, url: str, *, name: str | None = None, sha256: str | None = None, version: str | None = None
 ) -> dict[str, Any]:
     """Let the service fetch a scene, a ZIP file, and commit it.

@@ -22,7 +22,7 @@ from octasplat.engine.render.path_document import read_path_document
 from octasplat.engine.settings.nested_options import merge_options
 from octasplat.workers.client.api import Api, ServiceError
 from octasplat.workers.client.bucket import import_bucket, is_bucket_address
-from octasplat.workers.client.dataset_tasks import import_scene, is_web_address
+from octasplat.workers.client.dataset_tasks import import_dataset, is_web_address
 from octasplat.workers.client.download import download_archive, download_results
 from octasplat.workers.client.upload import upload_files, upload_scene
 from octasplat.workers.client.watch import watch_job
@@ -300,7 +300,7 @@ def _upload_if_needed(api: Api, scene: Path | str, on_event: EventListener, sha2
         return dataset_id
     if isinstance(scene, str) and is_web_address(scene):
         on_event(Noted(f"The service fetches {scene}."))
-        return _id_with_notes(import_scene(api, scene, sha256=sha256), on_event)
+        return _id_with_notes(import_dataset(api, scene, sha256=sha256), on_event)
     if isinstance(scene, str) and is_bucket_address(scene):
         on_event(Noted(f"The service fetches {scene}."))
         with counted_phase("upload", on_event) as progress:

@@ -16,13 +16,12 @@ the ground in that plane.
 """
 
 import json
-import os
-import shutil
-import uuid
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
 from octasplat.engine.core.errors import DatasetError, OutputError
+from octasplat.engine.core.partial_folders import partial_folder
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset.synthetic.config import CAMERA_MODELS, SyntheticDatasetConfig
 
@@ -64,11 +63,9 @@ def write_synthetic_dataset(
     from octasplat.engine.dataset.synthetic.write import write_dataset_files
 
     root = root.resolve()
-    partial = root.with_name(f".{root.name}.{os.getpid()}.{uuid.uuid4().hex[:8]}.partial")
-    try:
-        # Inside, as a signal may end the program as soon as the folder is there.
+    with ExitStack() as stack:
         try:
-            partial.mkdir(parents=True)
+            partial = stack.enter_context(partial_folder(root))
         except OSError as error:
             raise OutputError(
                 f"{root.parent} cannot be written to; name another folder ({error.strerror})."
@@ -76,8 +73,6 @@ def write_synthetic_dataset(
         write_dataset_files(partial, config, progress or (lambda _done, _total: None))
         write_json(partial / _STAMP, stamp)
         _replace_root(partial, root)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def _replace_root(partial: Path, root: Path) -> None:

@@ -30,17 +30,17 @@ if TYPE_CHECKING:
     from octasplat.workers.client.api import Api
 
 
-@click.command(short_help="Send a scene to the service and queue its reconstruction.")
-@click.argument("scene", type=SceneName(), required=False)
+@click.command(short_help="Send photographs to the service and queue their reconstruction.")
+@click.argument("scene", metavar="[PHOTOS]", type=SceneName(), required=False)
 @click.option(
     "--sha256",
     metavar="HEX",
-    help="Where SCENE is an address: what the ZIP file must be; then it is fetched once only.",
+    help="Where PHOTOS is an address: what the ZIP file must be; then it is fetched once only.",
 )
 @click.option(
     "--start-from",
     metavar="JOB",
-    help="Begin with the Gaussians of that reconstruction, finished or stopped; without SCENE on its "
+    help="Begin with the Gaussians of that reconstruction, finished or stopped; without PHOTOS on its "
     "photographs.",
 )
 @wait_options
@@ -60,7 +60,7 @@ def submit(
     printer: Printer,
     **given: Any,
 ) -> None:
-    """Send SCENE: a folder with images/ (and sparse/0), one of photographs, a ZIP file or a dataset's id.
+    """Send PHOTOS: a folder with images/ (and sparse/0), one of photographs, a ZIP file or a dataset's id.
 
     The same command goes on with an upload that broke off. The service itself fetches a ZIP file from a
     public https address: octasplat submit https://example.org/fox.zip
@@ -75,7 +75,7 @@ def submit(
 
     _check_output(output, wait=wait)
     if scene is None and start_from is None:
-        raise click.UsageError("Name SCENE, or a job by --start-from, whose photographs are taken.")
+        raise click.UsageError("Name PHOTOS, or a job by --start-from, whose photographs are taken.")
     options: ReconstructOptions = request_from_options(ReconstructOptions, given)
     check_block_options(options, options.config())  # what cannot be used is refused before anything is sent
     requested = options.model_dump(mode="json", exclude_unset=True)
@@ -178,7 +178,7 @@ def derive(
         what = Derivation(
             source,
             kind,
-            _with_assignments({}, given["assignments"]),
+            _with_assignments({}, given["set"]),
             scene=None if photographs is None else _as_dataset(api, photographs),
             label=given["label"],
             queue=given["queue"],
@@ -263,11 +263,11 @@ def _changed_options(given: dict[str, Any], job: dict[str, Any]) -> dict[str, An
     options: dict[str, Any] = {} if exports is None else {"exports": list(exports)}
     if job["kind"] != "reconstruct":
         # The service replaces an option as a whole, of which a name with dots is only a part.
-        sections = {assignment.partition("=")[0].partition(".") for assignment in given["assignments"]}
+        sections = {assignment.partition("=")[0].partition(".") for assignment in given["set"]}
         known = {name.strip(): job["options"].get(name.strip()) for name, dot, _ in sections if dot}
         result = {name: value for name, value in copy.deepcopy(known).items() if isinstance(value, dict)}
-        return _with_assignments(result | options, given["assignments"])
-    return options | ({"assignments": list(given["assignments"])} if given["assignments"] else {})
+        return _with_assignments(result | options, given["set"])
+    return options | ({"set": list(given["set"])} if given["set"] else {})
 
 
 def _parse_file_option(text: str) -> tuple[str, Path]:

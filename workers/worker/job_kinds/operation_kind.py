@@ -97,4 +97,6 @@ class OperationKind(JobKind[Any]):
         places = {"source": task.source, "output": task.results / self._output}
         if task.scene is not None and "dataset" in self.operation.request.model_fields:
             places["dataset"] = task.scene
-        return {name: place for name, place in places.items() if name in self.operation.request.model_fields}
+        # where an import reads is an option of its own
+        own = self.operation.request.model_fields.keys() - self.user_options.model_fields.keys()
+        return {name: place for name, place in places.items() if name in own}

@@ -15,7 +15,7 @@ from octasplat.workers.worker.job_kinds.operation_kind import OperationKind
 from octasplat.workers.worker.job_kinds.resource_limits import ResourceDemand
 from octasplat.workers.worker.task import Task
 
-_PRESET_OPTIONS = ("room", "materials", "bounds")
+_PRESET_OPTIONS = ("room", "materials", "box")
 """Options that decide what others are where nothing is said of these."""
 
 
