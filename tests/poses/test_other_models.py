@@ -81,7 +81,7 @@ def register(
     monkeypatch.setattr(module, "match_links", lambda *_given, **_named: extended is not None)
     monkeypatch.setattr(module, "match_remaining", match)
     monkeypatch.setattr(module, "write_model", lambda *_given: None)
-    monkeypatch.setattr(module, "_clearest_models", lambda *_given: {})
+    monkeypatch.setattr(module, "_models_by_match", lambda *_given: {})
     before = MappedModels([LARGEST, OTHER, SHARED, DOUBTFUL])
     capture = MatchedCapture(Path("mapping.db"), ("",) * COUNT, [], {}, LARGE, go_on, threads=1)
     after = register_remaining(capture, before)
@@ -137,8 +137,8 @@ def verified_pairs(database: Path) -> int:
         return int(opened.num_verified_image_pairs())
 
 
-def found_photographs(database: Path) -> list[list[int]]:
-    """Map and register what is left; return the photographs of each model."""
+def found_models(database: Path) -> list[Any]:
+    """Map and register what is left; return the models."""
     names = photographs_of(database)
     mappings: list[Path] = []
 
@@ -149,19 +149,69 @@ def found_photographs(database: Path) -> list[list[int]]:
 
     mapped = MappedModels(go_on(database, FROM_THE_BEGINNING))
     assert [model.num_reg_images() for model in mapped.models] == [FIRST - 2, SECOND - 2]
-    after = register_remaining(MatchedCapture(database, names, [], {}, LARGE, go_on, threads=1), mapped)
-    return [sorted(number - 1 for number in model.reg_image_ids()) for model in after.models]
+    return register_remaining(MatchedCapture(database, names, [], {}, LARGE, go_on, threads=1), mapped).models
 
 
-def test_photographs_of_no_model_join_the_one_that_they_see(
-    apart: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def photographs_by_model(models: Sequence[Any]) -> list[list[int]]:
+    return [sorted(number - 1 for number in model.reg_image_ids()) for model in models]
+
+
+@pytest.fixture
+def few_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Match few pairs, which takes no time."""
     monkeypatch.setattr(linking_pairs, "MAX_LINKS", 2)
     monkeypatch.setattr(linking_pairs, "LINKS_PER_PHOTOGRAPH", 6)
     monkeypatch.setattr(linking_pairs, "NEIGHBORS_BY_NAME", 2)
     monkeypatch.setattr(vocabulary, "TRAINING_DESCRIPTORS", 2000)
+
+
+BOTH = [list(range(FIRST)), list(range(FIRST, FIRST + SECOND))]
+
+
+def test_photographs_of_no_model_join_the_one_that_they_see(
+    apart: Path, tmp_path: Path, few_pairs: None
+) -> None:
     database = tmp_path / "mapping.db"
     shutil.copyfile(apart, database)
     before = verified_pairs(database)
-    assert found_photographs(database) == [list(range(FIRST)), list(range(FIRST, FIRST + SECOND))]
+    assert photographs_by_model(found_models(database)) == BOTH
     assert verified_pairs(database) <= before + 2 + len(LATE) * (6 + 2 * 2)
+
+
+def match_falsely(database: Path, one: int, other: int, count: int = 300) -> None:
+    """Let a photograph match one of another place in more features than it truly matches any."""
+    rng = np.random.default_rng(0)
+    with pycolmap.Database.open(database) as target:
+        features = [target.num_keypoints_for_image(number + 1) for number in (one, other)]
+        geometry = pycolmap.TwoViewGeometry()
+        geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+        drawn = [rng.permutation(many)[: min(*features, count)] for many in features]
+        geometry.inlier_matches = np.stack(drawn, axis=1).astype(np.uint32)
+        target.write_two_view_geometry(one + 1, other + 1, geometry)
+
+
+def test_photograph_whose_clearest_match_is_false_joins_the_model_of_the_next_one(
+    apart: Path, tmp_path: Path, few_pairs: None
+) -> None:
+    database, again = tmp_path / "mapping.db", tmp_path / "again" / "mapping.db"
+    again.parent.mkdir()
+    for copy in (database, again):
+        shutil.copyfile(apart, copy)
+        match_falsely(copy, 3, LATE[-1])
+    found = found_models(database)
+    assert photographs_by_model(found) == BOTH
+    # a search that is stopped before the last of these mappings goes on with the others
+    mappings = sorted(tmp_path.glob("mapping_*"))
+    for folder in mappings[:-1]:
+        shutil.copytree(folder, again.parent / folder.name)
+    assert model_bytes(found_models(again), tmp_path / "second") == model_bytes(found, tmp_path / "first")
+
+
+def model_bytes(models: Sequence[Any], folder: Path) -> list[dict[str, bytes]]:
+    written = []
+    for number, model in enumerate(models):
+        own = folder / str(number)
+        own.mkdir(parents=True)
+        model.write_binary(own)
+        written.append({path.name: path.read_bytes() for path in own.iterdir()})
+    return written
