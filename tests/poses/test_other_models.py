@@ -1,7 +1,7 @@
 """Photographs that the largest model of a large capture leaves out: of other models, and of none."""
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -117,19 +117,29 @@ LATE = (FIRST - 2, FIRST - 1, FIRST + SECOND - 2, FIRST + SECOND - 1)
 @pytest.fixture(scope="module")
 def apart(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a database of two places, with features and matches."""
-    path = tmp_path_factory.mktemp("apart") / "database.db"
+    path = make_places(tmp_path_factory.mktemp("apart") / "database.db", (FIRST, SECOND))
+    leave_without_matches(path, LATE)
+    return path
+
+
+def make_places(path: Path, counts: Sequence[int]) -> Path:
+    """Make a database of so many photographs of each of some places, with features and matches."""
     pycolmap.set_random_seed(1)
     with pycolmap.Database.open(path) as database:
-        for count in (FIRST, SECOND):
+        for count in counts:
             options = pycolmap.SyntheticDatasetOptions()
             options.num_rigs = options.num_cameras_per_rig = 1
             options.num_frames_per_rig = count
             options.num_points3D = 300
             pycolmap.synthesize_dataset(options, database)
-    others = range(FIRST + SECOND)
-    pairs = {(min(k, other), max(k, other)) for k in LATE for other in others if k != other}
-    remove_pairs(path, np.array(sorted(pairs)) + 1)
     return path
+
+
+def leave_without_matches(path: Path, photographs: Iterable[int]) -> None:
+    with pycolmap.Database.open(path) as database:
+        others = range(database.num_images())
+    pairs = {(min(k, other), max(k, other)) for k in photographs for other in others if k != other}
+    remove_pairs(path, np.array(sorted(pairs)) + 1)
 
 
 def verified_pairs(database: Path) -> int:
@@ -137,8 +147,8 @@ def verified_pairs(database: Path) -> int:
         return int(opened.num_verified_image_pairs())
 
 
-def found_models(database: Path) -> list[Any]:
-    """Map and register what is left; return the models."""
+def found_models(database: Path, mapped_first: Sequence[int] = (FIRST - 2, SECOND - 2)) -> list[Any]:
+    """Map, which comes to models of so many photographs, and register what is left; return the models."""
     names = photographs_of(database)
     mappings: list[Path] = []
 
@@ -148,7 +158,7 @@ def found_models(database: Path) -> list[Any]:
         return map_in_segments(copy, stored, seed=0, on_count=lambda _count: None, continuation=continuation)
 
     mapped = MappedModels(go_on(database, FROM_THE_BEGINNING))
-    assert [model.num_reg_images() for model in mapped.models] == [FIRST - 2, SECOND - 2]
+    assert [model.num_reg_images() for model in mapped.models] == [*mapped_first]
     return register_remaining(MatchedCapture(database, names, [], {}, LARGE, go_on, threads=1), mapped).models
 
 
@@ -205,6 +215,13 @@ def test_photograph_whose_clearest_match_is_false_joins_the_model_of_the_next_on
     for folder in mappings[:-1]:
         shutil.copytree(folder, again.parent / folder.name)
     assert model_bytes(found_models(again), tmp_path / "second") == model_bytes(found, tmp_path / "first")
+
+
+def test_photographs_of_no_model_make_one_of_their_own(tmp_path: Path, few_pairs: None) -> None:
+    database = make_places(tmp_path / "mapping.db", (SECOND, 6))
+    leave_without_matches(database, range(SECOND, SECOND + 6))
+    found = found_models(database, [SECOND])
+    assert photographs_by_model(found) == [list(range(SECOND)), list(range(SECOND, SECOND + 6))]
 
 
 def model_bytes(models: Sequence[Any], folder: Path) -> list[dict[str, bytes]]:
