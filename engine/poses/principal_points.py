@@ -49,6 +49,9 @@ def write_per_view_principal_points(
     """
     pycolmap.logging.minloglevel = 2
     given: Any = load_model(folder).reconstruction
+    # map coordinates are so large beside distances in the scene that an adjustment there ends too soon
+    middle = _middle(given)
+    _move(given, -middle)
     found = request.work / FOUND_FOLDER
     found.mkdir()
     with progress_stage(LENSES_STAGE, _ITERATIONS + 1, progress) as at:
@@ -63,6 +66,7 @@ def write_per_view_principal_points(
     if model is None or not after <= (1 - MIN_GAIN) * before:
         write_json(found / RECORD_FILE, {"lenses": None})
         return
+    _move(model, middle)
     write_model(model, found)
     shifts_px = [_shift_px(model, given, i) for i in sorted(model.images)]
     facts = {
@@ -72,6 +76,18 @@ def write_per_view_principal_points(
         "shift_px_most": float(np.max(shifts_px)),
     }
     write_json(found / RECORD_FILE, {"lenses": facts})
+
+
+def _middle(model: Any) -> Float64[np.ndarray, " 3"]:
+    """Return the mean of where the photographs of a model were taken; the origin without any."""
+    posed = [model.images[i] for i in sorted(model.images) if model.images[i].has_pose]
+    centres = [image.projection_center() for image in posed]
+    return np.asarray(np.mean(centres, axis=0)) if centres else np.zeros(3)
+
+
+def _move(model: Any, by: Float64[np.ndarray, " 3"]) -> None:
+    """Move a model, cameras and points."""
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), by))
 
 
 def _adjust_shared_principal_point(given: Any) -> tuple[Any | None, float]:

@@ -176,6 +176,21 @@ def test_cameras_on_a_rail_are_not_turned_about_it(tmp_path: Path, across: float
     np.testing.assert_allclose(centres(tmp_path / "found"), centres(tmp_path / "given"), atol=0.1)
 
 
+def test_lens_is_fitted_alike_in_map_coordinates(tmp_path: Path) -> None:
+    write_rail(tmp_path / "near", 1.0)
+    model = pycolmap.Reconstruction(str(tmp_path / "near"))
+    far = np.array([512345.6, 5403210.9, 310.2])
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), far))
+    (tmp_path / "far").mkdir()
+    model.write_binary(str(tmp_path / "far"))
+    near, moved = (adjust_principal_points(tmp_path / n, tmp_path / f"{n}_found") for n in ("near", "far"))
+    assert near is not None and moved is not None
+    for name in ("reprojection_px_before", "reprojection_px", "shift_px_median"):
+        np.testing.assert_allclose(moved[name], near[name], rtol=0.02)
+    off = centres(tmp_path / "far_found") - centres(tmp_path / "near_found")
+    np.testing.assert_allclose(off, np.broadcast_to(far, off.shape), atol=1e-3)
+
+
 @pytest.mark.exhaustive
 @pytest.mark.heavy
 def test_lens_fit_runs_during_reconstruction_and_resumes(moved: Path, tmp_path: Path) -> None:
