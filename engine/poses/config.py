@@ -124,7 +124,7 @@ class GivenModel(BaseModel):
 
     Attributes:
         model: folder of the COLMAP model.
-        names: of the request's photographs in it.
+        names: of the request's photographs, as the scene has them; the model may spell them otherwise.
         doubtful: which of them are in doubt.
     """
 

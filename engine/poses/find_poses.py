@@ -122,7 +122,7 @@ def repair_poses(
     Args:
         images: folder of the photographs.
         files: the photographs, below it.
-        given: the model, their names in it, and which of them are in doubt.
+        given: the model, the names of its photographs, and which of them are in doubt.
         output: becomes the folder of the changed model, with ``poses.json`` beside its files; nothing is
             written where no photograph is moved.
         config: settings.
