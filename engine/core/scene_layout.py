@@ -34,6 +34,8 @@ ARCHIVE_SUFFIXES = frozenset({".zip", ".7z", ".rar", ".tar", ".gz", ".tgz", ".bz
 VIDEO_SUFFIXES = frozenset({".mov", ".mp4", ".m4v", ".avi", ".mkv", ".mts", ".webm", ".insv", ".360"})
 IMAGES = "images/"
 """What the names of a scene's photographs begin with."""
+POSE_RECORD = "poses.json"
+"""Beside the files of a model that a run keeps: what was found, or changed of the model that was given."""
 MIN_PHOTOGRAPHS = 3
 """Fewer photographs than this do not make a scene."""
 DEPTH_FOLDERS = ("depths", "depth")

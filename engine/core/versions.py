@@ -23,7 +23,7 @@ PACKAGES = (
 )
 
 
-RESULTS_VERSION = 11
+RESULTS_VERSION = 12
 """Raised whenever the same settings give other results than before: what was begun under one number is begun
 anew under another, rather than gone on with."""
 

@@ -20,6 +20,7 @@ from octasplat.engine.core.scene_layout import (
 )
 from octasplat.engine.dataset.camera import Camera
 from octasplat.engine.dataset.colmap_model import ColmapModel, PosedImage, read_colmap_model
+from octasplat.engine.dataset.colmap_reading import load_model
 from octasplat.engine.dataset.damaged_images import find_damaged, refuse_damaged
 from octasplat.engine.dataset.depth_maps import find_depth_maps
 from octasplat.engine.dataset.image_info import ImageInfo
@@ -27,7 +28,13 @@ from octasplat.engine.dataset.image_names import match_image_names
 from octasplat.engine.dataset.images import read_image_info
 from octasplat.engine.dataset.masks import mask_for
 from octasplat.engine.dataset.model import DatasetModel, DatasetView, Observations
-from octasplat.engine.dataset.model_sources import find_model, has_model, other_models, posed_image_count
+from octasplat.engine.dataset.model_sources import (
+    find_model,
+    has_model,
+    is_changed_model,
+    other_models,
+    posed_image_count,
+)
 from octasplat.engine.dataset.photograph_files import files_below, image_folder, photographs_below
 from octasplat.engine.dataset.views_file import capped_size
 
@@ -66,7 +73,13 @@ def load_dataset_model(
         raise ConfigError(f"max_side is {max_side}; it must be at least 1 pixel.")
     _check_root(root, has_found_model=model_folder is not None)
     source = model_folder or find_model(root, model)
-    found = read_colmap_model(source, origin_world=origin_world)
+    sizes_px = {
+        path.relative_to(image_folder(root)).as_posix(): (info.width_px, info.height_px)
+        for path, info in (infos or {}).items()
+    }
+    found = read_colmap_model(source, origin_world=origin_world, sizes_px=sizes_px or None)
+    if model_folder is not None and is_changed_model(model_folder) and has_model(root):
+        found = _with_facts_of_given(found, find_model(root, model), sizes_px or None)
     if len(found.images) < min_views:
         raise DatasetError(
             f"The model in {found.folder} has {len(found.images)} posed images; "
@@ -87,6 +100,19 @@ def load_dataset_model(
         _warn_of_other_models(root, found.folder, warnings)
 
     return _model_of_views(root, found, located, masks, depths, max_side, warnings, infos or {})
+
+
+def _with_facts_of_given(
+    found: ColmapModel, given: Path, sizes_px: Mapping[str, tuple[int, int]] | None
+) -> ColmapModel:
+    """Return a model that was made of a given one with what a transforms file says beside the poses.
+
+    Its images have the names of the given one. Models of COLMAP say nothing else.
+    """
+    if not given.is_file():
+        return found
+    said = load_model(given, sizes_px)
+    return replace(found, held_out=said.held_out, masks=said.masks, depths=said.depths)
 
 
 def require_masks(model: DatasetModel) -> None:

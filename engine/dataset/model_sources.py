@@ -1,9 +1,11 @@
 """Where a scene keeps the poses of its photographs: COLMAP models by their folders, or transforms files."""
 
+import json
 from pathlib import Path
 
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.name_lists import name_list
+from octasplat.engine.core.scene_layout import POSE_RECORD
 from octasplat.engine.dataset.colmap_reading import MODEL_FILES
 from octasplat.engine.dataset.transforms_file import transforms_file
 
@@ -46,6 +48,16 @@ def find_model(root: Path, chosen: str | None = None) -> Path:
         f"{root / 'sparse/0'}, or have the poses found: octasplat reconstruct with --poses auto, or "
         f"octasplat submit.{described * bool(found)}"
     )
+
+
+def is_changed_model(folder: Path) -> bool:
+    """Return whether a model that a run keeps is that given for it, with some poses or lenses changed."""
+    try:
+        record = json.loads((folder / POSE_RECORD).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    is_found = isinstance(record, dict) and "photographs_sha256" in record
+    return isinstance(record, dict) and not is_found and ("moved" in record or "lenses" in record)
 
 
 def has_model(root: Path) -> bool:

@@ -1,4 +1,4 @@
-"""The process in which COLMAP works; see :mod:`octasplat.engine.poses.find_poses`, which starts it.
+"""The process in which COLMAP works; see :mod:`octasplat.engine.poses.running_colmap`, which starts it.
 
 Run as ``python -m octasplat.engine.poses.colmap_process``. The first line of stdin is the request as JSON,
 its end means that nobody waits any more. Events go to stdout, one JSON object a line, and then ``done`` or

@@ -5,6 +5,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from octasplat.engine.core.scene_layout import POSE_RECORD
 from octasplat.engine.settings.base import Settings
 from octasplat.engine.settings.fields import ADVANCED, Unit
 
@@ -14,7 +15,7 @@ PLACING_STAGE = "placing"
 """The last stage where poses are given, and only those in doubt are asked."""
 LENSES_STAGE = "lenses"
 """The only stage where a model's lenses are adjusted."""
-RECORD_FILE = "poses.json"
+RECORD_FILE = POSE_RECORD
 """What was found, and for which photographs; beside the model's files."""
 FOUND_FOLDER = "found"
 """The model's folder, while it lies below the one for the work."""
@@ -124,7 +125,7 @@ class GivenModel(BaseModel):
 
     Attributes:
         model: folder of the COLMAP model.
-        names: of the request's photographs in it.
+        names: of the request's photographs, as the scene has them; the model may spell them otherwise.
         doubtful: which of them are in doubt.
     """
 

@@ -179,12 +179,21 @@ def register_without_pairs_against_gps(
     if len(found.pairs) and not found.folded:
         remove_pairs(database, found.pairs)
     # max keeps the first of equals
-    models = max(mapped.models, map_again(database), key=best_rank)
+    models = max(mapped.models, map_again(database), key=_rank_with_others)
     if models is mapped.models or mapped.gps_error_m is not None:
         return replace(mapped, models=models)
     if find_gps_contradictions(models, database, ground_m).folded:
         return mapped
     return replace(mapped, models=models)
+
+
+def _rank_with_others(models: Sequence[Any]) -> tuple[int, int, int]:
+    """Return the sort key of what goes on from a model: its photographs, those of all models, and its points.
+
+    Photographs that join no model may make one of their own.
+    """
+    photographs, points = best_rank(models)
+    return photographs, len(photograph_indices(distinct_models(models))), points
 
 
 def describe_gps_contradictions(mapped: MappedModels) -> list[str]:

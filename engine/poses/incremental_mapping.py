@@ -37,7 +37,7 @@ _WEAK_INITIAL_INLIERS = 50
 """The same for the first two."""
 
 
-_MIN_SEEN_POINTS = 30
+MIN_SEEN_POINTS = 30
 """Points that a photograph placed so has to see in a large capture, whose places may look alike: in a street
 ten false ones saw 20 and less, and right ones 60 and more."""
 
@@ -253,7 +253,7 @@ def take_out_unsure(model: Any, sure: Collection[int]) -> None:
     """
     for index in sorted(photograph_indices([model]) - set(sure)):
         image = model.image(index + 1)
-        if image.num_points3D < _MIN_SEEN_POINTS:
+        if image.num_points3D < MIN_SEEN_POINTS:
             model.deregister_frame(image.frame_id)
 
 

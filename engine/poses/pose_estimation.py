@@ -11,7 +11,7 @@ Not done: matches among the others, so that photographs in doubt that overlap wi
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +64,17 @@ class Matches:
             self.translations_cam_from_world,
         )
 
+    @property
+    def middle_world(self) -> Float64[np.ndarray, " 3"]:
+        """Return the mean of where the others stand: map coordinates are large beside the distances there."""
+        centres = -np.einsum("pji,pj->pi", self.rotations_cam_from_world, self.translations_cam_from_world)
+        return np.asarray(centres.mean(axis=0))
+
+    def about(self, origin_world: Float64[np.ndarray, " 3"]) -> "Matches":
+        """Return the matches in a world with its origin there."""
+        moved = self.translations_cam_from_world + self.rotations_cam_from_world @ origin_world
+        return replace(self, translations_cam_from_world=moved)
+
 
 def sampson_distances(
     rotation_cam_from_world: Float64[np.ndarray, "3 3"],
@@ -95,14 +106,23 @@ def refine_pose(
     inlier_distance: float,
 ) -> Pose:
     """Return the pose nearby that fits best the matches within ``inlier_distance`` of the given one."""
-    pose = rotation_cam_from_world, translation_cam_from_world
+    middle = matches.middle_world
+    matches, pose = (
+        matches.about(middle),
+        _about((rotation_cam_from_world, translation_cam_from_world), middle),
+    )
     for _ in range(_REFINEMENT_ROUNDS):
         close = matches.select(inlier_mask(pose, matches, inlier_distance))
         if len(close.partner) < _DEGREES_OF_FREEDOM:
             break
         # again with the matches that agree with the better pose
         pose = _minimise_sampson(pose, close, inlier_distance)
-    return pose
+    return _about(pose, -middle)
+
+
+def _about(pose: Pose, origin_world: Float64[np.ndarray, " 3"]) -> Pose:
+    """Return a pose in a world with its origin there."""
+    return pose[0], pose[1] + pose[0] @ origin_world
 
 
 def _minimise_sampson(pose: Pose, matches: Matches, inlier_distance: float) -> Pose:
@@ -202,6 +222,8 @@ def estimate_pose(matches: Matches, given_pose: Pose, inlier_distance: float, *,
     """
     if len(matches.partner) < MIN_MATCHES:
         return None
+    middle = matches.middle_world
+    matches, given_pose = matches.about(middle), _about(given_pose, middle)
     count = len(matches.rotations_cam_from_world)
     # One rig holds the others as they stand in the world, the other one the photograph; both lists are one.
     ideal = pycolmap.Camera(model="SIMPLE_PINHOLE", width=2, height=2, params=[1.0, 0.0, 0.0])
@@ -237,4 +259,4 @@ def estimate_pose(matches: Matches, given_pose: Pose, inlier_distance: float, *,
         or agreed > MIN_GIVEN_INLIER_SHARE * agrees.sum()
     ):
         return None
-    return new
+    return _about(new, -middle)

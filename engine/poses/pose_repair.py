@@ -10,6 +10,7 @@ from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.events import EventListener
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset.colmap_reading import load_model
+from octasplat.engine.dataset.image_names import match_image_names
 from octasplat.engine.dataset.images import read_image_info
 from octasplat.engine.poses.config import (
     FEATURES,
@@ -91,7 +92,9 @@ class _PoseVerifier:
         self, request: PoseSearchRequest, given: GivenModel, read: Sequence[int], progress: EventListener
     ) -> None:
         self.model: Any = load_model(given.model).reconstruction
-        by_name = {image.name: image for image in self.model.images.values()}
+        # as the scene was opened: models may spell names of files otherwise, or leave suffixes out
+        files = match_image_names([image.name for image in self.model.images.values()], given.names)
+        by_name = {files.get(image.name): image for image in self.model.images.values()}
         self.images: dict[int, Any] = {k: by_name[name] for k, name in enumerate(given.names)}
         self._config, self._tell, self._threads = request.config, progress, request.threads or -1
         self._doubtful = frozenset(given.doubtful)

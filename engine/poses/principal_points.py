@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pycolmap
+from jaxtyping import Float64
 
 from octasplat.engine.core.events import EventListener
 from octasplat.engine.core.writing import write_json
@@ -30,6 +31,8 @@ MAX_SHIFT = 0.08
 """Of the longer side; a principal point that would move farther is not known from its photograph."""
 MIN_OBSERVATIONS_TO_MOVE = 15
 """Photographs that show fewer points stay where they are."""
+MAX_TURN_ERROR = 0.02
+"""Radians by which the turn about the longest axis of the cameras may be uncertain, for it to be taken."""
 _ITERATIONS = 3
 _MAX_SOLVER_STEPS = 50
 
@@ -46,6 +49,9 @@ def write_per_view_principal_points(
     """
     pycolmap.logging.minloglevel = 2
     given: Any = load_model(folder).reconstruction
+    # map coordinates are so large beside distances in the scene that an adjustment there ends too soon
+    middle = _middle(given)
+    _move(given, -middle)
     found = request.work / FOUND_FOLDER
     found.mkdir()
     with progress_stage(LENSES_STAGE, _ITERATIONS + 1, progress) as at:
@@ -60,6 +66,7 @@ def write_per_view_principal_points(
     if model is None or not after <= (1 - MIN_GAIN) * before:
         write_json(found / RECORD_FILE, {"lenses": None})
         return
+    _move(model, middle)
     write_model(model, found)
     shifts_px = [_shift_px(model, given, i) for i in sorted(model.images)]
     facts = {
@@ -69,6 +76,18 @@ def write_per_view_principal_points(
         "shift_px_most": float(np.max(shifts_px)),
     }
     write_json(found / RECORD_FILE, {"lenses": facts})
+
+
+def _middle(model: Any) -> Float64[np.ndarray, " 3"]:
+    """Return the mean of where the photographs of a model were taken; the origin without any."""
+    posed = [model.images[i] for i in sorted(model.images) if model.images[i].has_pose]
+    centres = [image.projection_center() for image in posed]
+    return np.asarray(np.mean(centres, axis=0)) if centres else np.zeros(3)
+
+
+def _move(model: Any, by: Float64[np.ndarray, " 3"]) -> None:
+    """Move a model, cameras and points."""
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), by))
 
 
 def _adjust_shared_principal_point(given: Any) -> tuple[Any | None, float]:
@@ -150,16 +169,31 @@ def _bundle_adjust(model: Any, fixed: set[int], error_px: float) -> bool:
 
 
 def _align_to_given(model: Any, given: Any) -> None:
-    """Align the model to the given cameras; those with too few observations keep their given poses."""
+    """Align the model to the given cameras; those with too few observations keep their given poses.
+
+    Cameras on a line, as on a rail, leave the turn about it open: their model stays in the world of the two
+    cameras that the adjustment has held.
+    """
     kept = [i for i in sorted(model.images) if model.images[i].num_points3D >= MIN_OBSERVATIONS_TO_MOVE]
     ours, theirs = (
         np.array([source.images[i].projection_center() for i in kept]) for source in (model, given)
     )
     similarity = pycolmap.estimate_sim3d(ours, theirs)
-    if similarity is not None:
+    if similarity is not None and _turn_error(similarity, ours, theirs) <= MAX_TURN_ERROR:
         model.transform(similarity)
     for i in sorted(set(model.images) - set(kept)):
         model.images[i].frame.rig_from_world = given.images[i].cam_from_world()
+
+
+def _turn_error(
+    similarity: Any, ours: Float64[np.ndarray, "n 3"], theirs: Float64[np.ndarray, "n 3"]
+) -> float:
+    """Return how far a similarity of cameras may be turned about their longest axis, in radians."""
+    matrix = similarity.matrix()
+    off = ours @ matrix[:, :3].T + matrix[:, 3] - theirs
+    across = float(np.linalg.svd(theirs - theirs.mean(axis=0), compute_uv=False)[1])
+    # an error of each position turns a set of that width (a root of a sum of squares) by so much
+    return float(np.sqrt(np.mean(np.sum(off**2, axis=1)))) / max(across, np.finfo(np.float64).tiny)
 
 
 def _shift_px(model: Any, given: Any, i: int) -> float:

@@ -82,9 +82,13 @@ def find_missing_poses(
 
 
 def tell_of_former_poses(output: Path, progress: EventListener) -> None:
-    """Tell where the poses that a new run goes on with were found by a version with other results."""
+    """Tell where the poses that a new run goes on with were found by a version with other results.
+
+    Those that do not state theirs may be of any version before, two of which have changed the mapping.
+    """
     record = read_pose_record(output / POSES)
-    if "photographs_sha256" in record and not versions.has_same_results(record):
+    is_stated = versions.STATED in record
+    if "photographs_sha256" in record and not (is_stated and versions.has_same_results(record)):
         progress(
             Warned(
                 f"The poses in {output / POSES} were found by a version with other results; they are taken "

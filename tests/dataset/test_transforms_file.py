@@ -15,6 +15,7 @@ import pytest
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.dataset import Dataset, DatasetModel, load_dataset_model
 from octasplat.engine.dataset.colmap_reading import load_model
+from octasplat.engine.dataset.dataset_part import open_dataset_part, photograph_facts
 
 _COUNT = 5
 
@@ -238,6 +239,42 @@ def test_masks_are_found_however_their_names_are_spelt(scene: Path, save_image: 
     _write(root, frames, **_PINHOLE)
     found = load_dataset_model(root)
     assert found.views[0].mask_path is not None and not any("masks that" in told for told in found.warnings)
+
+
+@pytest.mark.parametrize(
+    "record", [{"moved": ["a/frame_003.png"]}, {"lenses": {}}, {"photographs_sha256": "a"}]
+)
+def test_model_with_changed_poses_keeps_what_the_file_says_besides(
+    scene: Path, save_image: Callable[..., None], record: dict[str, Any]
+) -> None:
+    root, changed = _copy(scene, "other"), scene.parent / "poses"
+    frames = _frames(load_dataset_model(scene))
+    save_image(root / "masks" / "m1.png", np.full((24, 32, 1), 255, np.uint8))
+    frames[1]["mask_path"] = "masks/m1.png"
+    path = _write(root, frames[:3], "transforms_train.json", **_PINHOLE)
+    _write(root, frames[3:], "transforms_test.json", **_PINHOLE)
+    changed.mkdir()
+    load_model(path).reconstruction.write_binary(str(changed))
+    (changed / "poses.json").write_text(json.dumps(record))
+    given, found = load_dataset_model(root), load_dataset_model(root, model_folder=changed)
+    assert given.held_out == ("a/frame_003.png", "a/frame_004.png")
+    is_given = "photographs_sha256" not in record  # else poses were searched, whatever the file says
+    assert found.held_out == (given.held_out if is_given else None)
+    assert [view.mask_path for view in found.views] == (
+        [view.mask_path for view in given.views] if is_given else [None] * _COUNT
+    )
+    assert given.views[1].mask_path is not None
+
+
+def test_part_of_a_scene_needs_no_sizes_of_other_photographs(scene: Path, tmp_path: Path) -> None:
+    root = _copy(scene, "other")
+    _write(root, _frames(load_dataset_model(scene)), camera_angle_x=_ANGLE_X)
+    whole = Dataset.open(root, tmp_path / "cache")
+    facts, record = photograph_facts(whole), whole.views_record
+    for view in whole.views[2:]:
+        view.image_path.write_bytes(b"")  # as where one block needs the first two alone
+    part = open_dataset_part(root, tmp_path / "part", np.arange(2), facts, record)
+    assert part.cameras == whole.cameras
 
 
 def test_masks_and_unused_values(scene: Path, save_image: Callable[..., None]) -> None:

@@ -16,6 +16,7 @@ from octasplat.engine.core.events import Event, PhaseFinished, PhaseProgress, Ph
 from octasplat.engine.core.writing import restore_folder, write_json
 from octasplat.engine.pipeline.output_folder import claim_output, release_on_refusal
 from octasplat.engine.poses import find_poses as module
+from octasplat.engine.poses import running_colmap
 from octasplat.engine.poses.config import (
     DEFAULT_CONFIG,
     FOUND_FOLDER,
@@ -57,7 +58,7 @@ def fake_process(
         with os.fdopen(read, "rb") as stdout:
             yield SimpleNamespace(stdout=stdout, wait=lambda: 0)
 
-    monkeypatch.setattr(module, "_start_process", start)
+    monkeypatch.setattr(running_colmap, "start_process", start)
 
 
 def find(images: Path, output: Path, progress: Callable[[Event], None]) -> None:
@@ -149,11 +150,11 @@ def test_first_of_two_searches_ends_before_the_second(
 def test_long_steps_are_told_to_be_alive_wherever_they_are(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: list[Event], repeated: Event
 ) -> None:
-    monkeypatch.setattr(module, "_HEARTBEAT_SECONDS", -1.0)
-    monkeypatch.setattr(module, "_POLL_SECONDS", 0.0)
+    monkeypatch.setattr(running_colmap, "_HEARTBEAT_SECONDS", -1.0)
+    monkeypatch.setattr(running_colmap, "_POLL_SECONDS", 0.0)
     request = PoseSearchRequest(images=tmp_path, names=(), work=tmp_path, config=DEFAULT_CONFIG, threads=1)
     asked, heard = iter((False, True)), list[Event]()
-    process = module._ColmapProcess(request, heard.append, lambda: next(asked))
+    process = running_colmap.ColmapProcess(request, heard.append, lambda: next(asked))
     for line in lines_of(*told).splitlines()[:-1]:
         process._handle_line(line)
     read, write = os.pipe()
@@ -167,7 +168,7 @@ def test_long_steps_are_told_to_be_alive_wherever_they_are(
     [("", "starting"), ("read", "reading photographs"), ("matches", "matching"), ("poses", "placing photo")],
 )
 def test_crash_names_what_was_done(tmp_path: Path, stage: str, doing: str) -> None:
-    message = module._crash_message(-9, stage, tmp_path / "log.txt")
+    message = running_colmap.crash_message(-9, stage, tmp_path / "log.txt")
     assert message.startswith(f"COLMAP was ended by SIGKILL while {doing}")
 
 

@@ -280,9 +280,13 @@ def test_gps_of_zero_is_none_and_photographs_without_it_are_proposed_by_look(
     assert {(0, 28), (0, 29)} <= set(found)
 
 
-@pytest.mark.parametrize("results", [versions.RESULTS_VERSION, versions.RESULTS_VERSION - 1])
-def test_new_run_tells_of_poses_that_a_former_version_found(tmp_path: Path, results: int) -> None:
-    write_found(tmp_path / "poses", photographs_sha256="known", results=results)
+@pytest.mark.parametrize("results", [versions.RESULTS_VERSION, versions.RESULTS_VERSION - 1, None])
+def test_new_run_tells_of_poses_that_a_former_version_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, results: int | None
+) -> None:
+    monkeypatch.setattr(versions, "UNSTATED_RESULTS", versions.RESULTS_VERSION)
+    stated = {} if results is None else {"results": results}
+    write_found(tmp_path / "poses", photographs_sha256="known", **stated)
     choose_found_model(tmp_path / "poses", 1)  # the record is of the search, whatever model is taken
     events: list[Event] = []
     tell_of_former_poses(tmp_path, events.append)

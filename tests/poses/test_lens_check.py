@@ -132,6 +132,65 @@ def test_photograph_with_few_points_keeps_lens(moved: Path, tmp_path: Path) -> N
     np.testing.assert_allclose(poses[0], poses[1], atol=1e-12)
 
 
+def write_rail(folder: Path, across: float) -> None:
+    """Write a model of cameras so near to a line, each with a principal point of its own."""
+    rng, model = np.random.default_rng(1), pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(camera_id=1, model="PINHOLE", width=240, height=180, params=[220, 220, 120, 90])
+    )
+    points = np.stack([rng.uniform(-3, 13, 900), rng.uniform(-3, 3, 900), rng.uniform(3, 8, 900)], axis=1)
+    tracks = [pycolmap.Track() for _ in points]
+    for number, x in enumerate(np.linspace(0, 10, 16), start=1):
+        centre = np.array([x, *(across * rng.standard_normal(2))])
+        rotation = pycolmap.Rotation3d(np.radians(rng.uniform(-8, 8, 3)))
+        points_cam = (points - centre) @ rotation.matrix().T
+        xy_px = 220 * points_cam[:, :2] / points_cam[:, 2:] + [120, 90]
+        seen = np.flatnonzero((xy_px > 0).all(axis=1) & (xy_px < [240, 180]).all(axis=1))
+        spots = xy_px[seen] + rng.uniform(-12, 12, 2).round() + rng.normal(0, NOISE_PX, (len(seen), 2))
+        image = pycolmap.Image(
+            name=f"{number:03d}.png",
+            points2D=pycolmap.Point2DList([pycolmap.Point2D(spot) for spot in spots]),
+            camera_id=1,
+            image_id=number,
+        )
+        pose = pycolmap.Rigid3d(rotation, -rotation.matrix() @ centre)
+        model.add_image_with_trivial_frame(image, pose)
+        for place, point in enumerate(seen.tolist()):
+            tracks[point].add_element(number, place)
+    for point, track in zip(points, tracks, strict=True):
+        if track.length() > 1:
+            model.add_point3D(point, track)
+    folder.mkdir()
+    model.write_binary(str(folder))
+
+
+@pytest.mark.parametrize("across", [1e-4, 1e-3, 0.3])
+def test_cameras_on_a_rail_are_not_turned_about_it(tmp_path: Path, across: float) -> None:
+    write_rail(tmp_path / "given", across)
+    assert adjust_principal_points(tmp_path / "given", tmp_path / "found") is not None
+    given, found = (pycolmap.Reconstruction(str(tmp_path / name)) for name in ("given", "found"))
+    for number, image in given.images.items():
+        turned = found.images[number].cam_from_world().rotation.matrix()
+        between = image.cam_from_world().rotation.matrix() @ turned.T
+        assert np.degrees(np.arccos((np.trace(between) - 1) / 2)) < 2.0
+    np.testing.assert_allclose(centres(tmp_path / "found"), centres(tmp_path / "given"), atol=0.1)
+
+
+def test_lens_is_fitted_alike_in_map_coordinates(tmp_path: Path) -> None:
+    write_rail(tmp_path / "near", 1.0)
+    model = pycolmap.Reconstruction(str(tmp_path / "near"))
+    far = np.array([512345.6, 5403210.9, 310.2])
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), far))
+    (tmp_path / "far").mkdir()
+    model.write_binary(str(tmp_path / "far"))
+    near, moved = (adjust_principal_points(tmp_path / n, tmp_path / f"{n}_found") for n in ("near", "far"))
+    assert near is not None and moved is not None
+    for name in ("reprojection_px_before", "reprojection_px", "shift_px_median"):
+        np.testing.assert_allclose(moved[name], near[name], rtol=0.02)
+    off = centres(tmp_path / "far_found") - centres(tmp_path / "near_found")
+    np.testing.assert_allclose(off, np.broadcast_to(far, off.shape), atol=1e-3)
+
+
 @pytest.mark.exhaustive
 @pytest.mark.heavy
 def test_lens_fit_runs_during_reconstruction_and_resumes(moved: Path, tmp_path: Path) -> None:

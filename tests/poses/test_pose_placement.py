@@ -25,8 +25,19 @@ def seen(pose: Pose, points_world: Float64[np.ndarray, "n 3"]) -> Float64[np.nda
     return points_cam / points_cam[:, 2:]
 
 
-def matched(pose: Pose, others: list[Pose], count: int, wrong: float = 0.0, noise: float = 0.0) -> Matches:
-    """Matches of a camera at ``pose`` with each of the others, a share of them wrong."""
+def matched(
+    pose: Pose,
+    others: list[Pose],
+    count: int,
+    wrong: float = 0.0,
+    noise: float = 0.0,
+    about: Float64[np.ndarray, " 3"] | None = None,
+) -> Matches:
+    """Matches of a camera at ``pose`` with each of the others, a share of them wrong.
+
+    The others are in a world that has the middle of what they see at ``about``.
+    """
+    middle = np.zeros(3) if about is None else about
     rng = np.random.default_rng(0)
     ours, theirs = [], []
     for other in others:
@@ -34,7 +45,7 @@ def matched(pose: Pose, others: list[Pose], count: int, wrong: float = 0.0, nois
         ours.append(seen(pose, points))
         false = rng.random(count) < wrong
         points[false] = rng.normal(0, 0.5, (int(false.sum()), 3))
-        theirs.append(seen(other, points))
+        theirs.append(seen((other[0], other[1] + other[0] @ middle), points))
     rays, partner_rays = np.concatenate(ours), np.concatenate(theirs)
     rays[:, :2] += rng.normal(0, noise, (len(rays), 2)) if noise else 0.0
     return Matches(
@@ -66,21 +77,38 @@ def test_distances_from_known_line() -> None:
     np.testing.assert_allclose(np.abs(found), [0.0, 0.03 / np.sqrt(2), 0.04 / np.sqrt(2)], atol=1e-12)
 
 
-def test_refining_undoes_a_small_motion() -> None:
-    matches = matched(TRUE, ring(9), 40)
+NEAR, FAR = np.zeros(3), np.array([512345.6, 5403210.9, 310.2])
+"""Where the world has the middle of the ring; the second is of map coordinates."""
+
+
+def at(middle: Float64[np.ndarray, " 3"], pose: Pose) -> Pose:
+    return pose[0], pose[1] - pose[0] @ middle
+
+
+def centre(pose: Pose) -> Float64[np.ndarray, " 3"]:
+    return -pose[0].T @ pose[1]
+
+
+@pytest.mark.parametrize("middle", [NEAR, FAR], ids=["near", "far"])
+def test_refining_undoes_a_small_motion(middle: Float64[np.ndarray, " 3"]) -> None:
+    matches = matched(TRUE, [at(middle, other) for other in ring(9)], 40, about=middle)
     turn = Rotation.from_rotvec([0.002, -0.003, 0.001]).as_matrix()
-    rotation, translation = refine_pose(turn @ TRUE[0], TRUE[1] + [0.01, -0.01, 0.005], matches, 0.02)
-    np.testing.assert_allclose(rotation, TRUE[0], atol=1e-6)
-    np.testing.assert_allclose(translation, TRUE[1], atol=1e-5)
+    given = at(middle, (turn @ TRUE[0], TRUE[1] + [0.01, -0.01, 0.005]))
+    found = refine_pose(*given, matches, 0.02)
+    np.testing.assert_allclose(found[0], TRUE[0], atol=1e-6)
+    np.testing.assert_allclose(centre(found) - middle, centre(TRUE), atol=1e-5)
 
 
-def test_placing_replaces_wrong_pose() -> None:
-    matches = matched(TRUE, ring(12), 40, wrong=0.4, noise=0.3 * PIXEL)
-    found = estimate_pose(matches, WRONG, PIXEL, seed=0)
+@pytest.mark.parametrize("middle", [NEAR, FAR], ids=["near", "far"])
+def test_placing_replaces_wrong_pose(middle: Float64[np.ndarray, " 3"]) -> None:
+    others = [at(middle, other) for other in ring(12)]
+    matches = matched(TRUE, others, 40, wrong=0.4, noise=0.3 * PIXEL, about=middle)
+    given = at(middle, WRONG)
+    found = estimate_pose(matches, given, PIXEL, seed=0)
     assert found is not None
     turned = Rotation.from_matrix(found[0] @ TRUE[0].T).magnitude()
-    assert turned < 2 * PIXEL and np.linalg.norm(found[1] - TRUE[1]) < 0.01
-    again = estimate_pose(matches, WRONG, PIXEL, seed=0)
+    assert turned < 0.6 * PIXEL and np.linalg.norm(centre(found) - middle - centre(TRUE)) < 0.003
+    again = estimate_pose(matches, given, PIXEL, seed=0)
     assert again is not None and all(np.array_equal(a, b) for a, b in zip(found, again, strict=True))
 
 

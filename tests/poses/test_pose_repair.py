@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.events import Event, PhaseFinished, PhaseStarted, Warned
+from octasplat.engine.dataset.load import load_dataset_model
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.pipeline import reconstruct
 from octasplat.engine.poses.config import GivenModel, PosesConfig
@@ -93,6 +95,26 @@ def test_pose_repair_without_errors_writes_nothing(scene: Path, tmp_path: Path) 
     config = PosesConfig(first_witnesses=8)
     assert repair_poses(scene / "images", names, given, tmp_path / "none", config=config) == ()
     assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("spelling", [str.upper, lambda name: name.removesuffix(".png")])
+def test_photographs_are_found_in_a_model_that_spells_them_otherwise(
+    tmp_path: Path, spelling: Callable[[str], str]
+) -> None:
+    root = tmp_path / "scene"
+    write_synthetic_dataset(
+        root, SyntheticDatasetConfig(views=8, width_px=120, height_px=90, samples_per_side=1, points=200)
+    )
+    model = pycolmap.Reconstruction(str(root / "sparse" / "0"))
+    for image in model.images.values():
+        image.name = spelling(image.name)
+    model.write_binary(str(root / "sparse" / "0"))
+    views = load_dataset_model(root).views
+    names = tuple(view.name for view in views)
+    assert names != tuple(sorted(poses(root / "sparse" / "0")))
+    files = [view.image_path.relative_to(root / "images").as_posix() for view in views]
+    given = GivenModel(model=root / "sparse" / "0", names=names, doubtful=(0,))
+    assert repair_poses(root / "images", files, given, tmp_path / "none", threads=1) == ()
 
 
 @pytest.mark.exhaustive

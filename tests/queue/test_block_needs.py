@@ -2,7 +2,8 @@
 
 import asyncio
 import uuid
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -40,6 +41,7 @@ from octasplat.workers.storage.local import LocalStorage
 from octasplat.workers.worker.checkpoint import Checkpoint, plan_digest
 from octasplat.workers.worker.job_inputs import read_inputs
 from octasplat.workers.worker.job_kinds import get_job_kind
+from octasplat.workers.worker.task import BlocksPlanned, read_planned_blocks
 from tests.support.queue_jobs import NEW, SLIPS, claimed, fetched
 
 PLANNED = "f" * 64
@@ -51,15 +53,46 @@ def checkpoint() -> dict[str, object]:
     return {"attempt": 1, "stage": "train", "step": 5, "files": files, "results": versions.RESULTS_VERSION}
 
 
-async def start(pool: Pool, folder: Path, attempt: Attempt, numbers: Sequence[int] = (1, 2)) -> Job:
+async def start(
+    pool: Pool,
+    folder: Path,
+    attempt: Attempt,
+    numbers: Sequence[int] = (1, 2),
+    disk_bytes: Mapping[int, int] | None = None,
+) -> Job:
     """Let an attempt plan blocks; return the job that waits for them."""
-    plan = plan_digest(Checkpoint.from_row(checkpoint()))
-    blocks = [NewBlock(n, 10 * n, {"number": n, "iterations": 10 * n, "plan": plan}) for n in numbers]
+    plan, taken = plan_digest(Checkpoint.from_row(checkpoint())), disk_bytes or {}
+    blocks = [
+        NewBlock(n, 10 * n, {"number": n, "iterations": 10 * n, "plan": plan}, taken.get(n)) for n in numbers
+    ]
     async with storage_lease(pool, LocalStorage(folder, floor_bytes=0)) as lease:
         await attempt.start_blocks(
             SLIPS, checkpoint(), "toy", blocks, lease, first_steps=5, total_steps=5 + 10 * sum(numbers)
         )
     return await fetched(pool, attempt.job.id)
+
+
+async def test_block_asks_for_the_disk_that_it_takes_itself(conninfo: str, folder: Path) -> None:
+    async with open_pool(conninfo, max_size=6) as pool:
+        new = replace(NEW, estimate={"disk_bytes": 9_000, "memory_bytes": 70})
+        async with pool.connection() as connection:
+            attempt = await claimed(pool, await create_job(connection, SLIPS, new))
+        root = await start(pool, folder, attempt, disk_bytes={2: 800})
+        assert [block.estimate for block in await children(pool, root.id)] == [
+            {"disk_bytes": 9_000, "memory_bytes": 70}, {"disk_bytes": 800, "memory_bytes": 70}
+        ]  # fmt: skip
+        assert root.estimate == new.estimate
+
+
+PLAN = {"numbers": [1, 3], "iterations": [20, 10], "first_iterations": 5, "total_iterations": 50}
+
+
+def test_plan_of_a_program_is_read_with_the_disk_of_each_block() -> None:
+    told = BlocksPlanned((1, 3), (20, 10), 5, 50)
+    assert read_planned_blocks(PLAN) == told  # as of another version
+    assert read_planned_blocks({**PLAN, "disk_bytes": [1 << 40, 7]}) == replace(told, disk_bytes=(1 << 40, 7))
+    for wrong in ([7], [7, -1], [7, 1 << 60], [7, "x"], 7):
+        assert read_planned_blocks({**PLAN, "disk_bytes": wrong}) is None
 
 
 async def children(pool: Pool, root: uuid.UUID) -> list[Job]:

@@ -38,11 +38,13 @@ class NewBlock:
         number: of the block, from 1.
         iterations: which tell how long it takes, beside others.
         options: of its job; what a job with the same options has made is kept.
+        disk_bytes: that its job takes on the disk of its worker; None takes those of the whole job.
     """
 
     number: int
     iterations: int
     options: Mapping[str, Any]
+    disk_bytes: int | None = None
 
 
 async def start_blocks(
@@ -304,6 +306,9 @@ async def _count_needs(connection: Connection, job_id: uuid.UUID) -> int:
 
 
 def _job_of_block(root: Job, kind: str, block: NewBlock) -> NewJob:
+    estimate = root.estimate
+    if estimate is not None and block.disk_bytes is not None:
+        estimate = {**estimate, "disk_bytes": block.disk_bytes}
     return NewJob(
         owner=root.owner,
         kind=kind,
@@ -313,7 +318,7 @@ def _job_of_block(root: Job, kind: str, block: NewBlock) -> NewJob:
         dataset_id=root.dataset_id,
         label=f"block {block.number}",
         traceparent=root.traceparent,
-        estimate=root.estimate,
+        estimate=estimate,
         root_id=root.id,
         role=BLOCK,
         place=root.place_in_queue,

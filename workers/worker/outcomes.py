@@ -269,9 +269,17 @@ class OutcomeWriter:
                     if checkpoint is None:
                         raise StorageError("The plan of the blocks is not in the job's folder.")
                     plan = plan_digest(checkpoint)
+                    own_bytes = planned.disk_bytes or [None] * len(planned.numbers)
                     blocks = [
-                        NewBlock(number, length, kind.options_of_block(options, number, length, plan))
-                        for number, length in zip(planned.numbers, planned.iterations, strict=True)
+                        NewBlock(
+                            number,
+                            length,
+                            kind.options_of_block(options, number, length, plan),
+                            None if own is None else own + checkpoint.size_bytes,
+                        )
+                        for number, length, own in zip(
+                            planned.numbers, planned.iterations, own_bytes, strict=True
+                        )
                     ]
                     await self._attempt.start_blocks(
                         self._context.job_queue,

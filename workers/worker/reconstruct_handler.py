@@ -1,9 +1,13 @@
 """Programs of the jobs that reconstruct; only such a job's own process imports this."""
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
+from octasplat.engine.blocks.block_disk import block_disk_bytes
 from octasplat.engine.blocks.block_map import draw_block_map
+from octasplat.engine.blocks.block_photographs import read_block_photographs
+from octasplat.engine.blocks.piece_settings import block_settings
 from octasplat.engine.blocks.scene_plan import COARSE, ScenePlan, block_name, has_plan, load_plan
 from octasplat.engine.core.compiling import report_compilation
 from octasplat.engine.core.errors import CheckpointError, ConfigError, OctasplatError
@@ -130,8 +134,29 @@ def _plan_blocks(
     _show_coarse_scene(task, options, plan)
     lengths = {number: length for number, length in enumerate(plan.iterations, start=1) if length}
     total = sum(plan.expected_iterations().values())
-    task.progress(BlocksPlanned(tuple(lengths), tuple(lengths.values()), plan.coarse_iterations, total))
+    disk_bytes = _disk_of_blocks(task, options, plan, tuple(lengths))
+    task.progress(
+        BlocksPlanned(tuple(lengths), tuple(lengths.values()), plan.coarse_iterations, total, disk_bytes)
+    )
     return True
+
+
+def _disk_of_blocks(
+    task: Task, options: ReconstructJobConfig, plan: ScenePlan, numbers: Sequence[int]
+) -> tuple[int, ...]:
+    """Return how many bytes each block takes beside what it begins with; none of a plan of old."""
+    known = read_block_photographs(task.run / BLOCKS)
+    if known is None:
+        return ()
+    coarse = load_best(task.run / BLOCKS / COARSE)
+    views = read_views(task.run / VIEWS).viewpoints(options.max_side)
+    train, is_later = options.run_config().train, plan.is_finished_together
+    found = []
+    for number in numbers:
+        share = plan.blocks[number - 1].share
+        config = block_settings(train, share, plan.most_gaussians, is_finished_later=is_later)
+        found.append(block_disk_bytes(plan, number, known, views, config, coarse))
+    return tuple(found)
 
 
 def _show_map(task: Task, options: ReconstructJobConfig, plan: ScenePlan) -> None:

@@ -49,6 +49,7 @@ class BlocksPlanned(Event):
         iterations: of each.
         first_iterations: those before the blocks, which are done.
         total_iterations: of the whole job.
+        disk_bytes: that the training of each takes beside what it begins with; empty where that is not known.
     """
 
     kind: ClassVar[str] = "blocks_planned"
@@ -56,6 +57,7 @@ class BlocksPlanned(Event):
     iterations: tuple[int, ...]
     first_iterations: int
     total_iterations: int
+    disk_bytes: tuple[int, ...] = ()
 
 
 def read_planned_blocks(event: Mapping[str, Any]) -> BlocksPlanned | None:
@@ -63,13 +65,16 @@ def read_planned_blocks(event: Mapping[str, Any]) -> BlocksPlanned | None:
     try:
         numbers, iterations = ([int(n) for n in event[name]] for name in ("numbers", "iterations"))
         first, total = int(event["first_iterations"]), int(event["total_iterations"])
+        disk_bytes = [int(n) for n in event.get("disk_bytes", ())]
     except (KeyError, TypeError, ValueError, OverflowError):
         return None
     is_plausible = 0 < len(numbers) == len(set(numbers)) == len(iterations) <= MAX_BLOCKS
     amounts = (first, total, *numbers, *iterations)
     if not is_plausible or not all(0 <= amount < 2**31 for amount in amounts):
         return None
-    return BlocksPlanned(tuple(numbers), tuple(iterations), first, total)
+    if len(disk_bytes) not in (0, len(numbers)) or not all(0 <= n < 2**53 for n in disk_bytes):
+        return None
+    return BlocksPlanned(tuple(numbers), tuple(iterations), first, total, tuple(disk_bytes))
 
 
 def read_block_positions(event: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
