@@ -123,6 +123,18 @@ def test_evaluation_background_follows_a_white_training() -> None:
     assert ReconstructionConfig.model_validate(known) == known
 
 
+def test_evaluation_background_follows_a_revised_training() -> None:
+    white: dict[str, Any] = {"train": {"background": "white"}}
+    assert revise_config(as_json(resolve_config("fast")), **white) == resolve_config("fast", **white)
+    back = revise_config(as_json(resolve_config("fast", **white)), assignments=["background=black"])
+    assert back.evaluation_background == "black"
+    other = resolve_config("fast", settings={"evaluation_background": "white"})
+    assert revise_config(as_json(other), assignments=["background=random"]).evaluation_background == "white"
+    asked = resolve_config("fast", settings={"evaluation_background": "black"})
+    kept = revise_config(as_json(asked), **white, given=["evaluation_background"])
+    assert kept.evaluation_background == "black"
+
+
 @pytest.mark.parametrize(
     ("trained", "evaluated", "has_alpha", "differs"),
     [
