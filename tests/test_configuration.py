@@ -172,6 +172,15 @@ def test_revised_configuration_keeps_what_is_not_changed() -> None:
     assert revise_config(as_json(before), settings={"max_side": None}).max_side is None
 
 
+@pytest.mark.parametrize(("name", "materials"), [("high", True), ("high", False), ("standard", True)])
+def test_preset_without_settings_of_its_own_is_told(name: str, materials: bool) -> None:
+    notice = resolve_config(name, materials=materials).preset_notice()
+    assert (notice is not None) == (name == "high" and materials)
+    if notice is not None:
+        alike = [resolve_config(preset, materials=True).train for preset in ("high", "standard")]
+        assert alike[0] == alike[1] and "rays_per_pixel" in notice
+
+
 def test_revised_preset_brings_its_own_training() -> None:
     before = resolve_config("fast", settings={"max_side": 100}, assignments=["lr.quat=0.5"])
     after = revise_config(as_json(before), settings={"preset": "high"}, assignments=["iterations=9"])

@@ -69,6 +69,18 @@ class ReconstructionConfig(RunSettings):
             "not cover a photograph; leave the background of the evaluation out."
         )
 
+    def preset_notice(self) -> str | None:
+        """Return a sentence where the preset has no settings of its own with materials."""
+        recipe = self.train.materials.recipe if self.train.materials.learn else None
+        if self.preset != "high" or recipe is None:
+            return None
+        if _preset_settings("high", recipe) != _preset_settings("standard", recipe):
+            return None
+        return (
+            "With materials the preset high has the settings of standard; for more detail set rays_per_pixel "
+            "and --max-gaussians."
+        )
+
     def without_run_of_model(self) -> "tuple[ReconstructionConfig, Path | None]":
         """Return the settings with a found model named without the run that has found it, and that run."""
         named = parse_found_model(self.model)
