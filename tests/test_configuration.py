@@ -123,6 +123,18 @@ def test_evaluation_background_follows_a_white_training() -> None:
     assert ReconstructionConfig.model_validate(known) == known
 
 
+def test_evaluation_background_follows_a_revised_training() -> None:
+    white: dict[str, Any] = {"train": {"background": "white"}}
+    assert revise_config(as_json(resolve_config("fast")), **white) == resolve_config("fast", **white)
+    back = revise_config(as_json(resolve_config("fast", **white)), assignments=["background=black"])
+    assert back.evaluation_background == "black"
+    other = resolve_config("fast", settings={"evaluation_background": "white"})
+    assert revise_config(as_json(other), assignments=["background=random"]).evaluation_background == "white"
+    asked = resolve_config("fast", settings={"evaluation_background": "black"})
+    kept = revise_config(as_json(asked), **white, given=["evaluation_background"])
+    assert kept.evaluation_background == "black"
+
+
 @pytest.mark.parametrize(
     ("trained", "evaluated", "has_alpha", "differs"),
     [
@@ -158,6 +170,15 @@ def test_revised_configuration_keeps_what_is_not_changed() -> None:
     assert (after.train.lr.quat, after.train.lr.opacity, after.train.iterations) == (0.5, 0.25, 7)
     assert revise_config(as_json(before)) == before
     assert revise_config(as_json(before), settings={"max_side": None}).max_side is None
+
+
+@pytest.mark.parametrize(("name", "materials"), [("high", True), ("high", False), ("standard", True)])
+def test_preset_without_settings_of_its_own_is_told(name: str, materials: bool) -> None:
+    notice = resolve_config(name, materials=materials).preset_notice()
+    assert (notice is not None) == (name == "high" and materials)
+    if notice is not None:
+        alike = [resolve_config(preset, materials=True).train for preset in ("high", "standard")]
+        assert alike[0] == alike[1] and "rays_per_pixel" in notice
 
 
 def test_revised_preset_brings_its_own_training() -> None:

@@ -149,3 +149,11 @@ def test_config_diff_prints_changed_settings(tmp_path: Path) -> None:
     between = config_command("diff", str(first), str(second), "--json").stdout
     assert json.loads(between) == [{"name": "loss.l1", "before": 0.8, "after": 0.5}]
     assert "No setting differs" in config_command("diff", str(first), str(first)).stdout
+
+
+@pytest.mark.parametrize("recipe", ["split_sum", "near_field", "ref_gaussian"])
+def test_settings_that_come_with_a_recipe_do_not_count_as_changed(recipe: str) -> None:
+    config = resolve_config("fast", train={"materials": {"learn": True, "recipe": recipe}, "iterations": 9})
+    changed = {item.name for item in setting_differences(default_values(config), config)}
+    assert changed - {"materials.recipe"} == {"iterations"}
+    assert ("materials.recipe" in changed) == (recipe != "split_sum")

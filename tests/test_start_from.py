@@ -13,8 +13,17 @@ from octasplat.engine.core.events import CheckpointWritten, Event, Noted, Warned
 from octasplat.engine.files import export_scene, read_scene
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.pipeline import reconstruct
+from octasplat.engine.pipeline.start_scene import keep_start
 from octasplat.engine.render.environment_files import read_background_map
 from octasplat.engine.runs.config import ReconstructionConfig, resolve_config
+from octasplat.engine.train.loop.checkpoint import (
+    BestState,
+    latest_checkpoint,
+    load_best,
+    load_checkpoint,
+    save_best,
+    save_checkpoint,
+)
 from tests.support.tiny_dataset import make_tiny_dataset
 
 pytestmark = pytest.mark.heavy
@@ -88,6 +97,28 @@ def test_exposures_and_background_are_taken_from_the_files_of_a_run_without_chec
     before, after = (read_background_map(run / "background.exr") for run in (finished, unchanged))
     assert np.ptp(before) > 0.01
     np.testing.assert_allclose(after, before, atol=1e-5)
+
+
+def test_scene_of_the_best_state_comes_with_its_exposures(
+    scene: Path, finished: Path, tmp_path: Path
+) -> None:
+    """Where the last state was much worse, the best one was exported, and what it had learnt with it."""
+    run, output = tmp_path / "collapsed", tmp_path / "next"
+    shutil.copytree(finished, run)
+    path = latest_checkpoint(run / "checkpoints")
+    assert path is not None
+    last = load_checkpoint(path)
+    gains = last.shading["exposure.log_gains"]
+    best = BestState(last.gaussians, {**last.shading, "exposure.log_gains": gains + 0.5}, np.ones((2, 6)))
+    save_best(best, run / "checkpoints")
+    for collapsed in (False, True):
+        last.probes = [*last.probes[:-1], (last.iteration, last.best_psnr - (4.0 if collapsed else 2.0))]
+        save_checkpoint(last, run / "checkpoints", "any")
+        output.mkdir(exist_ok=True)
+        keep_start(scene, output, run, is_new=True)
+        found = load_best(output / "start")
+        np.testing.assert_array_equal(found.shading["exposure.log_gains"], gains + 0.5 * collapsed)
+        assert len(found.pose_corrections) == 2 * collapsed
 
 
 def test_depth_maps_that_are_added_keep_the_exposures(scene: Path, finished: Path, tmp_path: Path) -> None:

@@ -53,6 +53,8 @@ class FindPoses:
             )
             for sentence in notes_on_files(run.scene):
                 run.progress(Warned(sentence))
+            if (notice := config.preset_notice()) is not None:
+                run.progress(Noted(notice))
         find_missing_poses(
             scene=run.scene,
             output=run.output,

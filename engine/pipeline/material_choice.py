@@ -107,7 +107,8 @@ def choose_materials(run: ReconstructionRun) -> None:
 
     Nothing is chosen where a recipe was named or is to be used in any case (``materials.fallback``), or where
     the run begins with a scene; it is told all the same where materials lose accuracy. There are no trials
-    before a short training.
+    before a short training. A named recipe may be that of the default; ``materials.fallback=true`` lets it be
+    replaced.
 
     Raises:
         CancelledError: stopped as asked.
@@ -120,7 +121,8 @@ def choose_materials(run: ReconstructionRun) -> None:
         return
     run.progress(Noted("Two short trainings show first whether materials explain these photographs."))
     gain_db = _trial_gain_db(run, config.materials.recipe)
-    is_chosen = _asks_for_choice(run.config) and not has_start(run.output)
+    is_named = config.materials.fallback is None and "materials.recipe" in (run.given or ())
+    is_chosen = _asks_for_choice(run.config) and not is_named and not has_start(run.output)
     is_whole = not (run.dataset.has_alpha or run.dataset.has_masks)
     if gain_db >= -(MAX_WHOLE_LOSS_DB if is_whole and is_chosen else MAX_MATERIAL_LOSS_DB):
         if is_chosen:

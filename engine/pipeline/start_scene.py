@@ -213,12 +213,26 @@ def _read_source(source: Path) -> tuple[BestState, Origin]:
     if newest is not None:
         state = load_checkpoint(newest)
         gaussians, shading, corrections = state.gaussians, state.shading, state.pose_corrections
+        if _shows_best_state(source, state):
+            best = load_best(source / CHECKPOINTS)
+            shading, corrections = dict(best.shading), best.pose_corrections
     else:  # an edited run has none, and those of a finished one may have been deleted
         shading = _shading_of_results(source)
     if (source / SCENE).exists():
         gaussians = read_scene(source / SCENE)[0]
     assert gaussians is not None
     return BestState(gaussians, shading, corrections), run_origin(source) or NO_ORIGIN
+
+
+def _shows_best_state(source: Path, last: TrainState) -> bool:
+    """Return whether the scene of a finished run is its best state, as the last one was much worse.
+
+    Exposures, background, light and poses are then those of that state, too.
+    """
+    if not ((source / SCENE).exists() and (source / CONFIG).exists() and last.probes):
+        return False
+    margin_db = read_config(source / CONFIG).train.best_checkpoint_margin_db
+    return last.probes[-1][1] < last.best_psnr - margin_db
 
 
 def _shading_of_results(source: Path) -> dict[str, np.ndarray]:

@@ -16,7 +16,7 @@ from octasplat.engine.render.renderer import (
     shade_layer,
     tile_order,
 )
-from octasplat.engine.shading.protocol import ShadingModel
+from octasplat.engine.shading.protocol import LINEAR, ShadingModel
 from octasplat.engine.trace.protocol import Tracer
 
 MAX_RAYS_PER_SIDE = 4
@@ -25,8 +25,6 @@ UNEVEN_RATIO = 0.1
 """Display values of a pixel's rays that are further apart than this are asked for more of them."""
 RADIANCE_RAYS_PER_SIDE = 2
 """Rays across a pixel, and as many down, of pictures whose shading gives radiance."""
-LINEAR = "linear"
-"""The layer of a shading model that holds radiance."""
 
 
 @dataclass(frozen=True)

@@ -52,8 +52,7 @@ class ReconstructionConfig(RunSettings):
         train_background = (
             train.get("background") if isinstance(train, Mapping) else getattr(train, "background", None)
         )
-        # auto, random and learnt backgrounds are no fixed color
-        return {**values, "evaluation_background": "white" if train_background == "white" else "black"}
+        return {**values, "evaluation_background": _background_behind(train_background)}
 
     def background_mismatch(self, has_alpha: bool) -> str | None:
         """Return a sentence where views are measured on another background than they were trained on.
@@ -68,6 +67,18 @@ class ReconstructionConfig(RunSettings):
         return (
             f"The scene is trained on {trained} and measured on {evaluated}, which shows where it does "
             "not cover a photograph; leave the background of the evaluation out."
+        )
+
+    def preset_notice(self) -> str | None:
+        """Return a sentence where the preset has no settings of its own with materials."""
+        recipe = self.train.materials.recipe if self.train.materials.learn else None
+        if self.preset != "high" or recipe is None:
+            return None
+        if _preset_settings("high", recipe) != _preset_settings("standard", recipe):
+            return None
+        return (
+            "With materials the preset high has the settings of standard; for more detail set rays_per_pixel "
+            "and --max-gaussians."
         )
 
     def without_run_of_model(self) -> "tuple[ReconstructionConfig, Path | None]":
@@ -190,7 +201,8 @@ def revise_config(
     """Return a configuration with changes; another preset brings its own settings of the training.
 
     Where the changes switch materials on or off, or their recipe, the rest of what that means comes with it,
-    but for the settings that were given.
+    but for the settings that were given. The background of the evaluation goes on following that of the
+    training.
 
     Args:
         before: the configuration, as JSON.
@@ -206,8 +218,11 @@ def revise_config(
     """
     before = replace_former_names((ReconstructionConfig,), before)
     values, changes = _collect_changes(settings or {}, materials, train, assignments)
-    values = {**before, **values}
     former: Mapping[str, Any] = before.get("train", {})
+    follows = before.get("evaluation_background") == _background_behind(former.get("background"))
+    if follows and "evaluation_background" not in (given or ()):
+        before.pop("evaluation_background")  # that of the new background
+    values = {**before, **values}
     recipe, wanted = _learnt_recipe(former), _learnt_recipe(merge_options(former, changes))
     if values.get("preset") != before.get("preset"):
         former, wanted = {}, _learnt_recipe(changes)  # of another preset: none of its settings stay
@@ -222,6 +237,11 @@ def revise_config(
         )
     base = _preset_settings(values.get("preset"), wanted)
     return _validate_config({**values, "train": merge_options(base, merge_options(former, changes))})
+
+
+def _background_behind(train_background: object) -> Literal["black", "white"]:
+    """Return the background of an evaluation by that of the training; most are no fixed color."""
+    return "white" if train_background == "white" else "black"
 
 
 def read_given(path: Path) -> tuple[str, ...] | None:

@@ -128,8 +128,19 @@ def setting_differences(before: ReconstructionConfig, after: ReconstructionConfi
 
 
 def default_values(config: ReconstructionConfig) -> ReconstructionConfig:
-    """Return the defaults that a configuration began from: its preset's, with or without materials."""
-    return resolve_config(config.preset, materials=config.train.materials.learn)
+    """Return the defaults that a configuration began from: its preset's, with or without materials.
+
+    With materials of another recipe than the default's they are those that come with it; the recipe itself is
+    that of the default.
+    """
+    materials = config.train.materials
+    base = resolve_config(config.preset, materials=materials.learn)
+    usual = base.train.materials.recipe
+    if not materials.learn or materials.recipe == usual:
+        return base
+    others = resolve_config(config.preset, materials=True, train={"materials": {"recipe": materials.recipe}})
+    learnt = others.train.materials.model_copy(update={"recipe": usual})
+    return others.model_copy(update={"train": others.train.model_copy(update={"materials": learnt})})
 
 
 def format_value(value: object) -> str:

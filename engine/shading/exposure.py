@@ -13,10 +13,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
+from octasplat.engine.core.color import linear_to_srgb, srgb_to_linear
 from octasplat.engine.shading.exposure_estimation import estimate_values, times_from_names
 from octasplat.engine.shading.kernels.exposure import ExposedRays, expose_rays, gather_exposure_gradients
 from octasplat.engine.shading.plain import PLAIN_SHADING
 from octasplat.engine.shading.protocol import (
+    LINEAR,
     ShadedRayGradients,
     ShadedRays,
     ShadingGradients,
@@ -83,7 +85,21 @@ class ExposureModel(WrapperModel):
         rgb = np.empty_like(inner.rgb_srgb)
         # offsets belong to what is covered: the background is not exposed
         expose_rays(self._exposed_rays(np.broadcast_to(view, len(rgb)), inner), rgb)
-        return ShadedRays(rgb, inner.transmittance, inner, inner.layers)
+        return ShadedRays(rgb, inner.transmittance, inner, self._exposed_layers(inner.layers))
+
+    def _exposed_layers(
+        self, layers: Mapping[str, Float32[np.ndarray, "r _"]]
+    ) -> Mapping[str, Float32[np.ndarray, "r _"]]:
+        """Return the layers of a picture, its radiance as what the fixed view shows of it, up to white.
+
+        Pictures of several rays a pixel are means of that layer.
+        """
+        view = self._fixed_view
+        if view is None or LINEAR not in layers:
+            return layers
+        shown = linear_to_srgb(np.minimum(layers[LINEAR], np.float32(1)))
+        exposed = np.exp(self.log_gains[view]) * shown + self.offsets[view]
+        return {**layers, LINEAR: srgb_to_linear(exposed)}
 
     def _exposed_rays(self, view: Int64[np.ndarray, " r"], inner: ShadedRays) -> ExposedRays:
         return ExposedRays(

@@ -19,6 +19,9 @@ from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.shading.ray_patches import RayPatches
 from octasplat.engine.trace.protocol import GaussianGradients, Recording, TraceGradients, Tracer, TraceResult
 
+LINEAR = "linear"
+"""The layer of a shading model that holds radiance."""
+
 
 @dataclass(frozen=True)
 class TracedRays:

@@ -8,6 +8,7 @@ from jaxtyping import Float32, Float64
 from octasplat.engine.shading.depth_split import DepthLayers
 from octasplat.engine.shading.gbuffer import GBuffer
 from octasplat.engine.shading.incident_light import IncidentLightModel
+from octasplat.engine.shading.protocol import LINEAR
 from octasplat.engine.shading.split_sum import SurfacePoints
 
 
@@ -41,7 +42,7 @@ class ShadingContext:
         """Return radiance, materials, visibility and indirect light by name, means over each ray's layers."""
         surface, material = self.surface, self.gbuffer.surface.material
         values = {
-            "linear": radiance_linear,
+            LINEAR: radiance_linear,
             "albedo": material[:, :3],
             "metallic": material[:, 3:4],
             "roughness": material[:, 4:5],

@@ -9,12 +9,18 @@ import pytest
 from octasplat.engine.core.events import Event, HeldOutMeasured
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.dataset.model import Observations
+from octasplat.engine.render.pinhole_camera import PinholeCamera
+from octasplat.engine.render.renderer import render_rays
+from octasplat.engine.render.supersampling import render_filtered
 from octasplat.engine.shading.exposure import ExposureModel
 from octasplat.engine.shading.exposure_estimation import times_from_names
+from octasplat.engine.shading.material_settings import MaterialSettings, Recipe
 from octasplat.engine.shading.protocol import ShadedRayGradients, ShadingStep, TracedRays
+from octasplat.engine.shading.recipes import material_shading
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import GaussianGradients, TraceResult
 from octasplat.engine.train.config import TrainConfig
+from octasplat.engine.train.initialization.initial_gaussians import add_initial_materials
 from octasplat.engine.train.loop.state import TrainState, initial_state
 from octasplat.engine.train.loop.trainer import Trainer
 from octasplat.engine.train.views import exposure_changes
@@ -305,6 +311,26 @@ def test_named_view_is_rendered_with_its_exposure() -> None:
     again.load_known(["a", "b", "c"], {**exposures.as_dict(["a", "b", "x"]), "d": {}})
     np.testing.assert_array_equal(again.log_gains[:2], exposures.log_gains[:2])
     assert (again.log_gains[2] == 0).all()
+
+
+@pytest.mark.parametrize("recipe", ["split_sum", "near_field", "ref_gaussian"])
+def test_materials_are_measured_with_the_exposure_of_the_view(recipe: Recipe) -> None:
+    """A measured picture is a mean over rays of radiance, which is exposed as the colors of one ray are."""
+    settings = MaterialSettings(learn=True, environment_height=16, recipe=recipe)
+    model = material_shading(recipe)(settings, extent_world=1.0)
+    exposures = ExposureModel(3, rate=0.0, inner=model)
+    exposures.log_gains[1], exposures.offsets[1] = [-0.7, -0.5, 0.1], [0.02, -0.01, 0.03]
+    gaussians = add_initial_materials(PlanarDataset().initial_gaussians(400, opacity=0.9), settings)
+    tracer = CpuTracer(threads=1)
+    tracer.build(gaussians, exposures.features(gaussians))
+    rays = PinholeCamera.looking_at((0, 0, -2), (0, 0, 0), 8, 8, fov_y_degrees=20).rays()
+    black = np.zeros(3, np.float32)
+    for view in (0, 1):
+        one_ray = render_rays(tracer, rays, black, exposures.for_view(view)).rgb_srgb.mean(axis=(0, 1))
+        measured = render_filtered(tracer, rays, black, exposures.for_view(view), 2).rgb_srgb.mean(
+            axis=(0, 1)
+        )
+        np.testing.assert_allclose(measured, one_ray, atol=0.02)
 
 
 def test_changing_brightness_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:

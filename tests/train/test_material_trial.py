@@ -14,7 +14,7 @@ from octasplat.engine.dataset import Dataset
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
 from octasplat.engine.pipeline import material_choice, reconstruct, train_step
 from octasplat.engine.render.image_files import write_png
-from octasplat.engine.runs.config import read_config, resolve_config
+from octasplat.engine.runs.config import given_settings, read_config, resolve_config
 from octasplat.engine.train.loop import trial_training
 from octasplat.engine.train.loop.time_budget import TimeBudgetPlan, make_plan
 from octasplat.engine.train.loop.trial_training import material_gain_db
@@ -64,8 +64,10 @@ def gains(monkeypatch: pytest.MonkeyPatch, far_db: float, near_db: float = 0.0) 
 def run_few(scene: Path, output: Path, *more: str, resume: bool = False) -> tuple[list[str], list[str]]:
     """Run a training of two iterations with materials; return its warnings and notes."""
     events: list[Event] = []
-    config = resolve_config("fast", settings={"exports": ()}, materials=True, assignments=[*FEW, *more])
-    reconstruct(scene, output, config, threads=1, progress=events.append, resume=resume)
+    assignments = [*FEW, *more]
+    config = resolve_config("fast", settings={"exports": ()}, materials=True, assignments=assignments)
+    given = given_settings({}, materials=True, assignments=assignments) if more else None
+    reconstruct(scene, output, config, threads=1, progress=events.append, resume=resume, given=given)
     warned = [event.message for event in events if isinstance(event, Warned)]
     return warned, [event.message for event in events if isinstance(event, Noted)]
 
@@ -145,8 +147,14 @@ def test_choice_stays_when_the_run_goes_on(
         run_few(few_pixels, output, "materials.fallback=false", resume=True)
 
 
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("given", ["materials.fallback=false", "materials.recipe=near_field"])
+@pytest.mark.parametrize(
+    "given",
+    [
+        pytest.param("materials.fallback=false", marks=pytest.mark.exhaustive),
+        pytest.param("materials.recipe=near_field", marks=pytest.mark.exhaustive),
+        "materials.recipe=split_sum",
+    ],
+)
 def test_what_is_asked_for_by_name_is_learnt_and_warned_of(
     few_pixels: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: str
 ) -> None:

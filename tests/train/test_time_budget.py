@@ -2,15 +2,23 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from octasplat.engine.core.errors import CancelledError
 from octasplat.engine.core.events import CheckpointWritten, Event, Warned
+from octasplat.engine.dataset import Dataset
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.pipeline import reconstruct
 from octasplat.engine.runs.config import resolve_config
+from octasplat.engine.shading.deferred import DeferredShading
+from octasplat.engine.shading.incident_light import IncidentLightModel
+from octasplat.engine.shading.protocol import TracedRays
+from octasplat.engine.train.initialization.initial_gaussians import initial_train_state
+from octasplat.engine.train.loop import trial_training
 from octasplat.engine.train.loop.time_budget import TimeBudgetPlan, choose_plan
+from octasplat.engine.train.loop.trial_training import seconds_per_iteration
 
 
 def test_time_budget_larger_buys_more_gaussians() -> None:
@@ -60,3 +68,31 @@ def test_time_budget_plan_is_saved_and_reused(tmp_path: Path) -> None:
         checkpoint.unlink()
     reconstruct(scene, output, config, resume=True, threads=1)
     assert json.loads((output / "training.json").read_text())["iterations"] == 75
+
+
+@pytest.mark.parametrize(("secondary_from", "traces"), [(0.05, True), (1.0, False)])
+def test_pace_with_materials_is_that_of_iterations_with_reflections(
+    secondary_from: float, traces: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    traced: list[float] = []
+    trace_incident = DeferredShading._trace_incident
+
+    def counted(self: DeferredShading, traced_rays: TracedRays, *args: Any) -> IncidentLightModel:
+        if traced_rays.view is not None:  # of a batch, not of a probe
+            traced.append(traced_rays.training_progress)
+        return trace_incident(self, traced_rays, *args)
+
+    monkeypatch.setattr(DeferredShading, "_trace_incident", counted)
+    monkeypatch.setattr(trial_training, "WARM_UP_ITERATIONS", 2)
+    monkeypatch.setattr(trial_training, "TIMED_ITERATIONS", 3)
+    write_synthetic_dataset(
+        tmp_path / "scene",
+        SyntheticDatasetConfig(views=6, width_px=24, height_px=18, samples_per_side=1, points=100),
+    )
+    dataset = Dataset.open(tmp_path / "scene", tmp_path / "cache", threads=1)
+    materials = {"environment_height": 16, "secondary_from": secondary_from, "ambient_occlusion": False}
+    settings: dict[str, Any] = {"rays_per_batch": 64, "initial_points": 50, "max_gaussians": 100}
+    config = resolve_config("fast", materials=True, train={**settings, "materials": materials}).train
+    first = initial_train_state(dataset, config).gaussians
+    seconds_per_iteration(dataset, config, first, threads=1)
+    assert bool(traced) is traces

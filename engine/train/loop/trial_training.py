@@ -159,10 +159,17 @@ def seconds_per_iteration(
     def note(_done: int, _tracer: Tracer) -> None:
         times.append(time.perf_counter())
 
-    enough = WARM_UP_ITERATIONS + TIMED_ITERATIONS
+    enough, materials = WARM_UP_ITERATIONS + TIMED_ITERATIONS, config.materials
+    if materials.secondary_from < 1:  # nearly all iterations trace reflections, the first ones would not
+        materials = materials.model_copy(update={"secondary_from": 0.0})
     # it is stopped long before its end, and nothing is added meanwhile
     trial = config.model_copy(
-        update={"iterations": 100 * enough, "densify_from_iter": 100 * enough, "probe_rays": 256}
+        update={
+            "iterations": 100 * enough,
+            "densify_from_iter": 100 * enough,
+            "probe_rays": 256,
+            "materials": materials,
+        }
     )
     state = initial_state(first.select(slice(None)), config.seed)  # copied, as training changes them in place
     with suppress(CancelledError):
