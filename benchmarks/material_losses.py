@@ -42,7 +42,7 @@ from octasplat.engine.render.environment_files import read_environment
 from octasplat.engine.render.image_files import read_image
 from octasplat.engine.render.shots import view_shots
 from octasplat.engine.runs.config import read_config
-from octasplat.engine.runs.run_folder import CONFIG, PHOTOS, run_environment, run_extent
+from octasplat.engine.runs.run_folder import CONFIG, SCENE, run_environment, run_extent
 from octasplat.engine.shading.deferred import DeferredShading
 from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.shading.protocol import TracedRays
@@ -126,7 +126,7 @@ class Run:
 
     def __init__(self, folder: Path, truth: GroundTruth, surface: TrueSurface, threads: int) -> None:
         config = read_config(folder / CONFIG).train
-        self._gaussians, _ = read_scene(folder / PHOTOS)
+        self._gaussians, _ = read_scene(folder / SCENE)
         self._settings, self._trace, self._threads = config.materials, config.trace, threads
         self._surface, self._extent = surface, run_extent(folder, 1.0)
         assert truth.environment is not None

@@ -71,9 +71,9 @@ def test_training_of_a_former_version_begins_anew_and_says_so(
 def test_checkpoint_that_does_not_state_its_results_is_of_the_last_version_that_did_not(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_known: bool
 ) -> None:
+    monkeypatch.setattr(versions, "RESULTS_VERSION", versions.UNSTATED_RESULTS + (not is_known))
     path = stop_at(40, scene, tmp_path / "run")
     rewrite_meta(path, results=None)
-    monkeypatch.setattr(versions, "RESULTS_VERSION", versions.UNSTATED_RESULTS + (not is_known))
     told, events = resume(scene, tmp_path / "run")
     assert any(ANEW in text for text in told) != is_known
     assert (first_iteration(events) > 40) == is_known

@@ -11,7 +11,7 @@ from jaxtyping import Float32, UInt8
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from octasplat.engine.core.color import linear_to_srgb
-from octasplat.engine.core.errors import DamagedImageError
+from octasplat.engine.core.errors import DamagedImageError, DatasetError
 from octasplat.engine.core.image_messages import image_message
 from octasplat.engine.core.portable_names import is_text
 from octasplat.engine.core.threads import limit_torch_threads
@@ -151,9 +151,10 @@ def open_image(path: Path) -> tuple[Any, Any]:
 
     Raises:
         DamagedImageError: the file is missing or not an image.
+        DatasetError: its path is no text.
     """
     if not is_text(path):
-        raise DamagedImageError(f"{path} cannot be read as an image: its path is no text; rename it.", path)
+        raise DatasetError(f"{path} cannot be read as an image: its path is no text; rename it.")
     # By default OpenImageIO multiplies alpha into the colors of formats that store them straight.
     wish = oiio.ImageSpec()
     wish.attribute("oiio:UnassociatedAlpha", 1)

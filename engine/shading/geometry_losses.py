@@ -59,7 +59,7 @@ def add_surface_gradients(
         add_material_smoothness_gradient(
             traced, settings.smooth_weights, settings.smooth_metal, grad_features, grad_alpha
         )
-    if settings.dark_metal_weight > 0:
+    if settings.dark_metal_weight:
         add_dark_metal_gradient(traced, settings.dark_metal_weight, grad_features, grad_alpha)
 
 

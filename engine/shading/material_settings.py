@@ -27,7 +27,7 @@ class MaterialSettings(Settings):
     """Settings of learnt materials and environments; shares of the training are of all its iterations."""
 
     former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.MATERIALS
-    later_settings: ClassVar[frozenset[str]] = frozenset({"fallback"})
+    later_settings: ClassVar[frozenset[str]] = frozenset({"fallback", "dark_metal_weight"})
 
     learn: Annotated[bool, ADVANCED] = Field(
         False,
@@ -194,11 +194,11 @@ class MaterialSettings(Settings):
         description="So many times more smooth_weight counts between metals, which are one color more "
         "often and which have what is reflected wrongly painted on.",
     )
-    dark_metal_weight: Annotated[float, Unit("weight"), ADVANCED] = Field(
-        0.0,
+    dark_metal_weight: Annotated[float | None, Unit("weight"), ADVANCED] = Field(
+        None,
         ge=0,
         description="Weight of metallic in the loss where the albedo is darker than that of metals. Lower it "
-        "where a dark metal is taken for paint.",
+        "where a dark metal is taken for paint; 0 turns it off.",
     )
     prune_unseen: Annotated[bool, ADVANCED] = Field(
         True,
