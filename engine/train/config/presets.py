@@ -18,8 +18,9 @@ SHORT_MATERIAL_RATES = {"mean": 0.05, "log_scale": 0.04, "albedo": 0.08, "metall
 """Learning rates of such a training."""
 EDGE_WEIGHT = 1.0
 """``loss.edges`` with the recipe ``split_sum``."""
-DARK_METAL_WEIGHT = 0.02
-"""Its ``materials.dark_metal_weight``; ``near_field`` has its metallic stand for what is a mirror at all."""
+SHORT_DARK_METAL_WEIGHT = 0.02
+"""Its ``materials.dark_metal_weight`` in such a training, in which metallic does not get far from where it
+begins. In a long one rough metals that are seen too dark lose by it."""
 EDGE_NORMAL_WEIGHT = 0.05
 """Its ``materials.normal_weight`` and ``depth_normal_weight``: rays for edges move the Gaussians, too."""
 
@@ -59,7 +60,7 @@ def with_materials(config: TrainConfig, recipe: Recipe = "split_sum") -> TrainCo
         "depth_split": 8.0,
     }
     if has_edge_rays:
-        materials["dark_metal_weight"] = DARK_METAL_WEIGHT
+        materials["dark_metal_weight"] = SHORT_DARK_METAL_WEIGHT if is_short else None
         materials.update(normal_weight=EDGE_NORMAL_WEIGHT, depth_normal_weight=EDGE_NORMAL_WEIGHT)
     densify = McmcConfig(
         copies="area",
