@@ -161,6 +161,25 @@ def test_former_names_of_a_derived_job_are_read_and_the_later_one_counts() -> No
         )
 
 
+@pytest.mark.parametrize(
+    ("name", "former", "new"),
+    [
+        ("reconstruct", {"assignments": ["lr.quat=0.5"]}, {"set": ["lr.quat=0.5"]}),
+        ("surface", {"bounds": [0, 0, 0, 1, 2, 3]}, {"box": [0, 0, 0, 1, 2, 3]}),
+        ("material", {"scale": {"roughness": 0.5}}, {"multiply": {"roughness": 0.5}}),
+        ("import", {"file": "a.spz"}, {"source": "a.spz"}),
+    ],
+)
+def test_job_that_was_queued_by_the_last_version_is_run_by_this_one(
+    name: str, former: dict[str, Any], new: dict[str, Any]
+) -> None:
+    kind = get_job_kind(name)
+    with collect_notices() as notices:
+        assert kind.resolve(kind.as_requested(former)) == kind.resolve(new)
+        assert kind.as_requested(former) == kind.as_requested(new)
+    assert notices and all("is called" in notice for notice in notices)
+
+
 def test_configuration_of_a_run_of_the_last_version_is_read_with_one_notice(tmp_path: Path) -> None:
     content = EXPECTED.model_dump(mode="json")
     content |= {"evaluate_background": content.pop("evaluation_background"), "preset": "paper"}
@@ -176,6 +195,11 @@ def test_configuration_of_a_run_of_the_last_version_is_read_with_one_notice(tmp_
 @pytest.mark.parametrize(
     ("command", "flags"),
     [
+        ("reconstruct", {"--frames-per-second": "--fps"}),
+        ("estimate", {"--frames-per-second": "--fps"}),
+        ("material", {"--scale": "--multiply"}),
+        ("relight", {"--rotate": "--rotation"}),
+        ("surface", {"--components": "--keep-components"}),
         ("relight", {"--by": "--integrator", "--depth": "--max-bounces", "--on": "--other-dataset"}),
         ("surface", {"--texture": "--texture-size", "--depth": "--depth-mode", "--scene": "--dataset"}),
         ("evaluate", {"--background": "--evaluation-background", "--on": "--other-dataset"}),
@@ -230,7 +254,7 @@ def test_former_names_map_to_fields(model: type[BaseModel]) -> None:
     assert not set(names.fields) & set(model.model_fields)
     known = set(model.model_fields)
     others = {"relocate_low_weight_below", "relocate_low_weight_fraction", "relocate_low_weight_rounds"}
-    others |= {"other_dataset", "dataset"}  # of the request alone
+    others |= {"other_dataset", "dataset", "fps"}  # of the request alone
     assert set(names.fields.values()) | set(names.flags.values()) <= known | others
 
 

@@ -1,7 +1,7 @@
 """Images that cannot be read to their ends: all of a dataset are named at once, to be replaced in one go."""
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TypeVar
@@ -9,7 +9,7 @@ from typing import TypeVar
 from octasplat.engine.core.errors import DamagedImageError, DatasetError
 from octasplat.engine.core.name_lists import name_list
 from octasplat.engine.dataset.image_info import ImageInfo
-from octasplat.engine.dataset.images import read_photo
+from octasplat.engine.dataset.images import read_image_info, read_photo
 
 MAX_NAMED = 20
 """Most damaged images that a sentence names."""
@@ -30,6 +30,28 @@ def decoding_workers(threads: int, infos: Iterable[ImageInfo]) -> int:
     """
     largest = max((_BYTES_PER_PIXEL * info.width_px * info.height_px for info in infos), default=1)
     return min(threads if threads > 0 else os.cpu_count() or 1, max(1, DECODING_BYTES // largest))
+
+
+def read_headers(
+    paths: Iterable[Path], known: Mapping[Path, ImageInfo] | None = None
+) -> tuple[dict[Path, ImageInfo], list[DamagedImageError]]:
+    """Return the headers of images by their files, and the faults of those that are no images.
+
+    Args:
+        paths: the files.
+        known: headers that were read before.
+
+    Raises:
+        DatasetError: an image is refused for another reason.
+    """
+    found: dict[Path, ImageInfo] = {}
+    faults: list[DamagedImageError] = []
+    for path in paths:
+        try:
+            found[path] = (known or {}).get(path) or read_image_info(path)
+        except DamagedImageError as error:
+            faults.append(error)
+    return found, faults
 
 
 def collect_results(

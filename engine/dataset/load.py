@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from jaxtyping import Float64
 
-from octasplat.engine.core.errors import ConfigError, DamagedImageError, DatasetError
+from octasplat.engine.core.errors import ConfigError, DatasetError
 from octasplat.engine.core.local_origin import Origin, describe_origin, is_set
 from octasplat.engine.core.name_lists import name_list
 from octasplat.engine.core.relative_paths import normalize_name
@@ -21,11 +21,10 @@ from octasplat.engine.core.scene_layout import (
 from octasplat.engine.dataset.camera import Camera
 from octasplat.engine.dataset.colmap_model import ColmapModel, PosedImage, read_colmap_model
 from octasplat.engine.dataset.colmap_reading import load_model
-from octasplat.engine.dataset.damaged_images import find_damaged, refuse_damaged
+from octasplat.engine.dataset.damaged_images import find_damaged, read_headers, refuse_damaged
 from octasplat.engine.dataset.depth_maps import find_depth_maps
 from octasplat.engine.dataset.image_info import ImageInfo
 from octasplat.engine.dataset.image_names import match_image_names
-from octasplat.engine.dataset.images import read_image_info
 from octasplat.engine.dataset.masks import mask_for
 from octasplat.engine.dataset.model import DatasetModel, DatasetView, Observations
 from octasplat.engine.dataset.model_sources import (
@@ -302,7 +301,7 @@ def _warn_of_other_models(root: Path, taken: Path, warnings: list[str]) -> None:
         )
 
 
-def _read_headers(
+def _checked_headers(
     root: Path, paths: Sequence[Path], known: Mapping[Path, ImageInfo]
 ) -> Mapping[Path, ImageInfo]:
     """Return the headers of photographs by their files.
@@ -310,13 +309,7 @@ def _read_headers(
     Raises:
         DatasetError: some cannot be read; those that end early behind a header that is fine are named, too.
     """
-    found: dict[Path, ImageInfo] = {}
-    faults: list[DamagedImageError] = []
-    for path in paths:
-        try:
-            found[path] = known.get(path) or read_image_info(path)
-        except DamagedImageError as error:
-            faults.append(error)
+    found, faults = read_headers(paths, known)
     if faults:
         refuse_damaged(
             sorted([*faults, *find_damaged(list(found.items()))], key=lambda fault: fault.path), root
@@ -340,7 +333,7 @@ def _model_of_views(
     infos: list[ImageInfo] = []
     observed_px: list[Float64[np.ndarray, "k 2"]] = []
     camera_indices: dict[Camera, int] = {}
-    headers = _read_headers(root, located.paths, infos_known)
+    headers = _checked_headers(root, located.paths, infos_known)
     for image, path, mask, depth in zip(images, located.paths, masks, depths, strict=True):
         info = headers[path]
         original = found.cameras[image.camera_id]

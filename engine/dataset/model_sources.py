@@ -56,8 +56,12 @@ def is_changed_model(folder: Path) -> bool:
         record = json.loads((folder / POSE_RECORD).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return False
-    is_found = isinstance(record, dict) and "photographs_sha256" in record
-    return isinstance(record, dict) and not is_found and ("moved" in record or "lenses" in record)
+    # a model that was found states its photographs
+    return (
+        isinstance(record, dict)
+        and "photographs_sha256" not in record
+        and ("moved" in record or "lenses" in record)
+    )
 
 
 def has_model(root: Path) -> bool:

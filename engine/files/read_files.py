@@ -19,9 +19,9 @@ from octasplat.engine.gaussians.scene_metadata import UNKNOWN_METADATA, SceneMet
 from octasplat.engine.geometry.imported_mesh import ImportedMesh
 
 FOLDER_FILES = ("scene.ply", "meta.json")
+"""What a folder is read by: the scene of a run, or the description of an unpacked SOG."""
 _RUN_FILE = "config.json"
 """What the folder of a run has from its beginning."""
-"""What a folder is read by: the scene of a run, or the description of an unpacked SOG."""
 
 
 def read_scene(

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from pydantic import BeforeValidator, Field, model_validator
 
@@ -10,6 +10,7 @@ from octasplat.engine.core.events import EventListener, ignore_events
 from octasplat.engine.files.channel_columns import ChannelChoice
 from octasplat.engine.gaussians.flattening import ImportReport
 from octasplat.engine.operations.base import Operation, Options, Result, WritingRequest, never_stop, stop_if
+from octasplat.engine.settings import renamed_settings
 from octasplat.engine.settings.fields import InputFile, Positional, Spelling
 
 
@@ -22,6 +23,8 @@ def read_channels(value: object) -> object:
 
 class ImportOptions(Options):
     """Options of which file to read, and how."""
+
+    former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.IMPORT
 
     source: Annotated[InputFile, Positional("IN")] = Field(
         description="The scene to read, a file of any known format."

@@ -1,7 +1,7 @@
 """``material``: change the materials of selected Gaussians."""
 
 from collections.abc import Callable
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from pydantic import Field
 
@@ -16,11 +16,14 @@ from octasplat.engine.operations.base import (
     options_of,
     stop_if,
 )
+from octasplat.engine.settings import renamed_settings
 from octasplat.engine.settings.fields import InputFile, Output, Spelling
 
 
 class MaterialOptions(Selection, MaterialChange, Options):
     """Options of how materials change, and of which Gaussians: those for which all given conditions hold."""
+
+    former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.MATERIAL
 
     mesh: Annotated[InputFile | None, Spelling(metavar="MESH")] = Field(
         None,

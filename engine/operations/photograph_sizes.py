@@ -12,19 +12,12 @@ def photograph_sizes(scene: Path) -> list[ImageSizes]:
     Raises:
         DatasetError: there are none, or some cannot be read.
     """
-    from octasplat.engine.core.errors import DamagedImageError
-    from octasplat.engine.dataset.damaged_images import refuse_damaged
-    from octasplat.engine.dataset.images import read_image_info
+    from octasplat.engine.dataset.damaged_images import read_headers, refuse_damaged
     from octasplat.engine.dataset.photograph_files import image_folder
     from octasplat.engine.poses.photographs import photographs_of_scene
 
     folder = image_folder(scene)
-    infos, faults = [], []
-    for name in photographs_of_scene(scene):
-        try:
-            infos.append(read_image_info(folder / name))
-        except DamagedImageError as error:
-            faults.append(error)
+    infos, faults = read_headers(folder / name for name in photographs_of_scene(scene))
     refuse_damaged(faults, folder)
-    counts = Counter((info.width_px, info.height_px) for info in infos)
+    counts = Counter((info.width_px, info.height_px) for info in infos.values())
     return [ImageSizes(width, height, count) for (width, height), count in counts.items()]

@@ -50,6 +50,7 @@ from octasplat.engine.train.loop.checkpoint import (
     save_best,
 )
 from octasplat.engine.train.loop.state import TrainState
+from octasplat.engine.train.loop.validation_probe import is_best_exported
 from octasplat.engine.train.sampling.pixel_sampler import valid_pixel_fraction
 from octasplat.engine.train.shading_factory import ShadingOptions, make_shading
 
@@ -232,7 +233,7 @@ def _shows_best_state(source: Path, last: TrainState) -> bool:
     if not ((source / SCENE).exists() and (source / CONFIG).exists() and last.probes):
         return False
     margin_db = read_config(source / CONFIG).train.best_checkpoint_margin_db
-    return last.probes[-1][1] < last.best_psnr - margin_db
+    return is_best_exported(last.probes[-1][1], last.best_psnr, margin_db)
 
 
 def _shading_of_results(source: Path) -> dict[str, np.ndarray]:

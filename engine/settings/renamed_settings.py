@@ -44,7 +44,11 @@ RUN = FormerNames(
     {"preset": {"paper": "redisplats"}},
     {"--background": "evaluation_background"},
 )
-RECONSTRUCT = FormerNames({**RUN.fields, "rays": "rays_per_batch"}, RUN.values, RUN.flags)
+RECONSTRUCT = FormerNames(
+    {**RUN.fields, "rays": "rays_per_batch", "assignments": "set", "frames_per_second": "fps"},
+    RUN.values,
+    RUN.flags,
+)
 TRAIN = FormerNames(
     {
         "stop_early": "early_stopping_db",
@@ -106,14 +110,17 @@ EVALUATE = FormerNames(
     {"background": "evaluation_background", "on": "other_dataset"}, flags={"--scene": "dataset"}
 )
 RELIGHT = FormerNames(
-    {"by": "integrator", "depth": "max_bounces", "on": "other_dataset"}, flags={"--scene": "dataset"}
+    {"by": "integrator", "depth": "max_bounces", "on": "other_dataset"},
+    flags={"--scene": "dataset", "--rotate": "rotation_degrees"},
 )
 DEMO = FormerNames({"scene_only": "dataset_only"}, RUN.values)
 DATASET = FormerNames(flags={"--scene": "dataset"})
 EXTRACTION = FormerNames(
-    {"depth": "depth_mode", "settle": "refine_vertices", "texture_side": "texture_size"},
-    flags={"--texture": "texture_size", "--scene": "dataset"},
+    {"depth": "depth_mode", "settle": "refine_vertices", "texture_side": "texture_size", "bounds": "box"},
+    flags={"--texture": "texture_size", "--scene": "dataset", "--components": "keep_components"},
 )
+MATERIAL = FormerNames({"scale": "multiply"})
+IMPORT = FormerNames({"file": "source"})
 EXPORT = FormerNames(
     {"texture_size": "falloff_texture_size", "colour": "color"}, flags={"--texture": "falloff_texture_size"}
 )

@@ -204,7 +204,10 @@ def _former_flags(model: type[BaseModel], fields: Mapping[str, FieldInfo]) -> di
     return {
         flag: name
         for flag, name in spelt.items()
-        if flag not in taken and name in fields and not _spelling_of(fields[name]).hidden
+        if flag not in taken
+        and name in fields
+        and not _spelling_of(fields[name]).hidden
+        and _find_mark(fields[name], Positional) is None
     }
 
 

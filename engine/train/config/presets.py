@@ -60,8 +60,11 @@ def with_materials(config: TrainConfig, recipe: Recipe = "split_sum") -> TrainCo
         "depth_split": 8.0,
     }
     if has_edge_rays:
-        materials["dark_metal_weight"] = SHORT_DARK_METAL_WEIGHT if is_short else None
-        materials.update(normal_weight=EDGE_NORMAL_WEIGHT, depth_normal_weight=EDGE_NORMAL_WEIGHT)
+        materials.update(
+            normal_weight=EDGE_NORMAL_WEIGHT,
+            depth_normal_weight=EDGE_NORMAL_WEIGHT,
+            dark_metal_weight=SHORT_DARK_METAL_WEIGHT if is_short else None,
+        )
     densify = McmcConfig(
         copies="area",
         error_power=1.0 if has_edge_rays else 0.0,

@@ -116,15 +116,10 @@ def material_gain_db(
     color = evaluation_background(background)
     probe = draw_probe(dataset, indices, MATERIAL_PROBE_RAYS, color, np.random.default_rng(seed))
     found = []
-    # For all recipes those settings by which it was measured what a trial says.
+    # For all recipes those settings by which it was measured what a trial says. There are no rays for edges:
+    # these show colors, and would say for materials what colors alone explain.
     lit = with_materials(preset("fast"), "near_field")
-    lit = lit.model_copy(
-        update={
-            "materials": lit.materials.model_copy(update={"recipe": recipe}),
-            # Rays that show colors would say for materials what colors alone explain.
-            "loss": lit.loss.model_copy(update={"edges": None}),
-        }
-    )
+    lit = lit.model_copy(update={"materials": lit.materials.model_copy(update={"recipe": recipe})})
     for base in (preset("fast"), lit):
         config = base.model_copy(update={**MATERIAL_TRIAL_SETTINGS, "background": background, "seed": seed})
         gaussians, shading = _train(

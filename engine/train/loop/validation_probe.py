@@ -94,6 +94,15 @@ def psnr_from_mse(mse: float) -> float:
     return float(-10 * np.log10(max(mse, 1e-10)))
 
 
+def is_best_exported(last_psnr: float, best_psnr: float, margin_db: float) -> bool:
+    """Return whether a training ends with its best state instead of its last one, which is much worse.
+
+    >>> is_best_exported(25.0, 25.2, 0.3), is_best_exported(24.8, 25.2, 0.3)
+    (False, True)
+    """
+    return last_psnr < best_psnr - margin_db
+
+
 class ValidationProbe:
     """Refuses broken states, keeps the best one, and chooses what is exported.
 
@@ -163,7 +172,7 @@ class ValidationProbe:
         The shading and the pose corrections of ``state`` become theirs, too.
         """
         last, _ = measure_probe(self._probe, self._dataset, tracer, shading)
-        if last >= state.best_psnr - self._best_margin_db:
+        if not is_best_exported(last, state.best_psnr, self._best_margin_db):
             return state.gaussians
         self._progress(
             Warned(
