@@ -38,6 +38,7 @@ from octasplat.engine.runs.run_folder import (
     SCENE,
     TRAINING,
 )
+from octasplat.engine.runs.residual_file import write_residual
 from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.shading.recipes import material_shading
@@ -48,6 +49,7 @@ from octasplat.engine.train.loop.checkpoint import (
     remove_former_checkpoints,
     run_fingerprint,
 )
+from octasplat.engine.train.loop.residual_fit import fit_residual_colors, residual_iterations
 from octasplat.engine.train.loop.state import MinScale, TrainState
 from octasplat.engine.train.loop.time_budget import make_plan, read_plan, write_plan
 from octasplat.engine.train.loop.trainer import Trainer
@@ -115,10 +117,25 @@ def _train(run: ReconstructionRun, clock: PhaseClock) -> FlatGaussians:
     trainer = _make_trainer(run, config, nearest_world, clock)
     gaussians = trainer.run()
     _write_learnt_light(trainer.shading, gaussians, run.output, run.progress)
+    _fit_residual(run, trainer, gaussians)
     _write_training_record(
         trainer, run.dataset, nearest_world, clock, run.output, keeps_near_free=config.camera_clearance > 0
     )
     return gaussians
+
+
+def _fit_residual(run: ReconstructionRun, trainer: Trainer, gaussians: FlatGaussians) -> None:
+    """Fit and write residual colors where a training with materials asks for them."""
+    config, done = trainer.config, trainer.state.iteration
+    if not (iterations := residual_iterations(config, done)):
+        return
+    run.progress(Noted(f"Fitting residual colors, {iterations:,} iterations with all else kept."))
+    residual_sh = fit_residual_colors(
+        gaussians, trainer.dataset, trainer.shading, config,
+        iterations=iterations, excluded_views=trainer.state.excluded_views, threads=run.threads,
+        should_stop=run.should_stop,
+    )  # fmt: skip
+    write_residual(run.output, residual_sh)
 
 
 def _train_in_blocks(run: ReconstructionRun, count: int) -> FlatGaussians:
