@@ -97,7 +97,8 @@ def finished_shading(
         deferred.light.set_radiance(read_environment(run_environment(output)))
     if (background := find_background(shading)) is not None:
         background.set_map(read_background_map(output / BACKGROUND))
-    if deferred is not None and scene is not None and (residual_sh := read_residual(output, scene)) is not None:
+    residual_sh = None if deferred is None or scene is None else read_residual(output, scene)
+    if deferred is not None and scene is not None and residual_sh is not None:
         tracer = make_tracer(trace, threads=threads_in_use())
         tracer.build(with_residual(scene, residual_sh))
         shading = add_residual(shading, ResidualColors(deferred, tracer, residual_sh))

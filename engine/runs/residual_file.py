@@ -38,11 +38,13 @@ def read_residual(output: Path, gaussians: FlatGaussians) -> Float32[np.ndarray,
             found = arrays[_SH]
     except ARCHIVE_DAMAGE as error:
         raise ConfigError(
-            f"{path} cannot be read ({type(error).__name__}); delete it to show the run without residual colors."
+            f"{path} cannot be read ({type(error).__name__}); delete it to show the run without residual "
+            "colors."
         ) from None
     is_harmonics = found.dtype == np.float32 and found.ndim == 3 and found.shape[2] == 3
     if not is_harmonics or len(found) != len(gaussians) or not np.isfinite(found).all():
         raise ConfigError(
-            f"{path} does not belong to the scene beside it; delete it to show the run without residual colors."
+            f"{path} does not belong to the scene beside it; delete it to show the run without residual "
+            "colors."
         )
     return found

@@ -44,6 +44,8 @@ of a pixel, so that a dark channel beside a bright one is coarse."""
 BACKGROUND = "background.exr"
 RESIDUAL = "residual.npz"
 """Harmonics of the residual colors of a run with materials, row by row as in its scene."""
+RESIDUAL_ITERATIONS = "residual_iterations"
+"""Key of the record of a training that has fitted residual colors."""
 EVALUATIONS = "on"
 """Below it are the measures on photographs of other folders, a folder each."""
 _COMPARED_PHOTOGRAPHS = 8

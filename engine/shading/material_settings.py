@@ -231,8 +231,8 @@ class MaterialSettings(Settings):
         ge=0,
         le=10,
         description="After the training, so many times its iterations fit residual colors: harmonics of what "
-        "materials and light do not explain, all else kept. Pictures in the learnt light add them; relighting, "
-        "edits and stages do not. 0 leaves them out.",
+        "materials and light do not explain, all else kept. Pictures in the learnt light add them; "
+        "relighting, edits and stages do not. 0 leaves them out.",
     )
 
     @field_validator("up_world")

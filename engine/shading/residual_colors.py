@@ -34,9 +34,7 @@ ZERO_SRGB = np.float32(0.5)
 """Color that harmonics of zero have: the residual of a ray is what it shows less that."""
 
 
-def with_residual(
-    gaussians: FlatGaussians, residual_sh: Float32[np.ndarray, "n k 3"]
-) -> FlatGaussians:
+def with_residual(gaussians: FlatGaussians, residual_sh: Float32[np.ndarray, "n k 3"]) -> FlatGaussians:
     """Return Gaussians that show residual colors, in front of :data:`ZERO_SRGB`.
 
     Args:
@@ -47,7 +45,7 @@ def with_residual(
 
 
 def residual_of(result: TraceResult) -> Float32[np.ndarray, "r 3"]:
-    """Return the residual colors along rays, premultiplied, from what a tracer of :func:`with_residual` found.
+    """Return the residual colors along rays, premultiplied, of what Gaussians of :func:`with_residual` show.
 
     Those of one Gaussian are -0.5 at least.
     """

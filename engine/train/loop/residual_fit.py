@@ -1,8 +1,8 @@
 """The fit of residual colors after a training with materials: all but these is kept.
 
 Materials and light explain a part of each photograph; the rest is fitted by harmonics of each Gaussian
-(:mod:`octasplat.engine.shading.residual_colors`). Given geometry and shading, that is a linear problem, and an
-iteration takes a fraction of one that shades, as what materials show along a ray is computed once.
+(:mod:`octasplat.engine.shading.residual_colors`). Given geometry and shading, that is a linear problem, and
+an iteration takes a fraction of one that shades, as what materials show along a ray is computed once.
 """
 
 from collections import deque
