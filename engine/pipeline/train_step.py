@@ -43,14 +43,14 @@ from octasplat.engine.runs.run_folder import (
 from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.shading.recipes import material_shading
-from octasplat.engine.train.config import TrainConfig, iteration_count
+from octasplat.engine.train.config import TrainConfig, iteration_count, residual_iteration_count
 from octasplat.engine.train.initialization.initial_gaussians import initial_train_state
 from octasplat.engine.train.loop.checkpoint import (
     load_latest_checkpoint,
     remove_former_checkpoints,
     run_fingerprint,
 )
-from octasplat.engine.train.loop.residual_fit import fit_residual_colors, residual_iterations
+from octasplat.engine.train.loop.residual_fit import fit_residual_colors
 from octasplat.engine.train.loop.state import MinScale, TrainState
 from octasplat.engine.train.loop.time_budget import make_plan, read_plan, write_plan
 from octasplat.engine.train.loop.trainer import Trainer
@@ -129,7 +129,7 @@ def _train(run: ReconstructionRun, clock: PhaseClock) -> FlatGaussians:
 def _fit_residual(run: ReconstructionRun, trainer: Trainer, gaussians: FlatGaussians) -> int:
     """Fit and write residual colors where a training with materials asks for them; return the iterations."""
     config, done = trainer.config, trainer.state.iteration
-    if not (iterations := residual_iterations(config, done)):
+    if not (iterations := residual_iteration_count(config, done)):
         return 0
     run.progress(Noted(f"Fitting residual colors, {iterations:,} iterations with all else kept."))
     residual_sh = fit_residual_colors(

@@ -11,13 +11,11 @@ from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.runs.run_folder import RESIDUAL
 from octasplat.engine.train.loop.checkpoint import ARCHIVE_DAMAGE
 
-_SH = "sh"
-
 
 def write_residual(output: Path, residual_sh: Float32[np.ndarray, "n k 3"]) -> None:
     """Write the harmonics of the residual color of each Gaussian of a run, atomically."""
     with atomic_replace(output / RESIDUAL) as temporary:
-        np.savez(temporary, **{_SH: residual_sh})
+        np.savez(temporary, sh=residual_sh)
 
 
 def read_residual(output: Path, gaussians: FlatGaussians) -> Float32[np.ndarray, "n k 3"] | None:
@@ -34,8 +32,9 @@ def read_residual(output: Path, gaussians: FlatGaussians) -> Float32[np.ndarray,
     if not path.exists():
         return None
     try:
-        with np.load(path, allow_pickle=False) as arrays:
-            found = arrays[_SH]
+        # an open file by itself, as numpy leaves that of a damaged one open
+        with path.open("rb") as handle, np.load(handle, allow_pickle=False) as arrays:
+            found = arrays["sh"]
     except ARCHIVE_DAMAGE as error:
         raise ConfigError(
             f"{path} cannot be read ({type(error).__name__}); delete it to show the run without residual "

@@ -11,8 +11,8 @@ from octasplat.engine.shading.plain import PLAIN_SHADING, PlainShading
 from octasplat.engine.shading.protocol import ShadedRays, ShadingModel, TracedRays
 from octasplat.engine.shading.residual_colors import residual_of, with_residual
 from octasplat.engine.trace.factory import make_tracer
-from octasplat.engine.train.config import TrainConfig
-from octasplat.engine.train.loop.residual_fit import fit_residual_colors, residual_iterations
+from octasplat.engine.train.config import TrainConfig, residual_iteration_count
+from octasplat.engine.train.loop.residual_fit import fit_residual_colors
 from tests.support.planar_dataset import PlanarDataset
 
 WANTING_SRGB = np.array([0.1, -0.05, 0.02], np.float32)
@@ -121,11 +121,11 @@ def test_can_be_stopped() -> None:
 def test_iterations_follow_those_of_the_training(materials: bool, assigned: str, expected: int) -> None:
     given = [f"materials.residual_share={assigned}"]
     config = resolve_config("fast", materials=materials, assignments=given).train
-    assert residual_iterations(config, 100) == expected
+    assert residual_iteration_count(config, 100) == expected
 
 
 def test_recipes_of_other_papers_have_none() -> None:
     for recipe in ("ref_gaussian", "near_field"):
         config = resolve_config("fast", materials=True, assignments=[f"materials.recipe={recipe}"]).train
-        assert residual_iterations(config, 100) == 0
-    assert residual_iterations(resolve_config("fast", materials=True).train, 100) > 0
+        assert residual_iteration_count(config, 100) == 0
+    assert residual_iteration_count(resolve_config("fast", materials=True).train, 100) > 0

@@ -26,7 +26,13 @@ from octasplat.engine.shading.residual_colors import residual_of, with_residual
 from octasplat.engine.shading.wrapper import WrapperModel
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import TraceGradients
-from octasplat.engine.train.config import LearningRates, LossWeights, TrainConfig
+from octasplat.engine.train.config import (
+    ITERATIONS_PER_BATCH,
+    KEPT_BATCHES,
+    LearningRates,
+    LossWeights,
+    TrainConfig,
+)
 from octasplat.engine.train.optimization.adam import Adam
 from octasplat.engine.train.optimization.losses import pixel_loss
 from octasplat.engine.train.optimization.weight_averaging import AVERAGING_INTERVAL, WeightAverage
@@ -34,10 +40,6 @@ from octasplat.engine.train.sampling.batches import Batch, BatchOptions, BatchSo
 from octasplat.engine.train.sampling.pixel_sampler import TrainingData
 from octasplat.engine.train.shading_factory import find_exposures
 
-ITERATIONS_PER_BATCH = 4
-"""For each batch that is drawn and shaded; the others look at kept ones again, which costs a fourth."""
-KEPT_BATCHES = 256
-"""So many of them, the last ones: 170 MB with 8,192 rays each."""
 WEIGHT_DECAY = np.float32(0.001)
 """Share of the harmonics that each step takes off, so that what few rays tell stays small."""
 AVERAGED_SHARE = 0.2
@@ -76,13 +78,6 @@ class _ShadedPlusResidual(WrapperModel):
     def backward(self, traced: TracedRays, shaded: ShadedRays, grad: ShadedRayGradients) -> ShadingGradients:
         # geometry is kept, so that the share of the residual in alpha does not matter
         return ShadingGradients(TraceGradients(grad.rgb_srgb))
-
-
-def residual_iterations(config: TrainConfig, iterations: int) -> int:
-    """Return how many iterations fit residual colors after a training of so many; 0: there are none."""
-    if not config.materials.learn:
-        return 0
-    return round((config.materials.residual_share or 0.0) * iterations)
 
 
 def fit_residual_colors(
