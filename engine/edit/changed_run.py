@@ -27,6 +27,8 @@ from octasplat.engine.runs.run_folder import (
     EVENTS,
     HELD_OUT,
     POSES,
+    RESIDUAL,
+    RESIDUAL_ITERATIONS,
     SCENE,
     TRAINING,
     VIEWS,
@@ -34,8 +36,9 @@ from octasplat.engine.runs.run_folder import (
 
 _COPIED_FILES = (CONFIG, EVENTS, HELD_OUT, VIEWS, ENVIRONMENT_HDR, ENVIRONMENT_EXR, BACKGROUND)
 """What is as true of the scene after it was changed where it stands."""
-_MEASURED = "training_views"
-"""Of the facts on a training: how well its scene showed the views that it was trained on."""
+_LEFT_OUT = ("training_views", RESIDUAL_ITERATIONS)
+"""Of the facts on a training: how well its scene showed the views that it was trained on, and what was fitted
+to them in the end."""
 
 
 def check_new_run(target: Path) -> None:
@@ -98,7 +101,19 @@ def write_edited_run(
             partial.replace(target)
     except OSError as error:
         raise OutputError(f"{target} cannot be written ({error.strerror or error}).") from None
-    return messages
+    return (*messages, *_residual_note(source))
+
+
+def _residual_note(source: Path) -> list[str]:
+    """Return a sentence on the residual colors that an edited run has not, if its source has them."""
+    if not (source / TRAINING).exists():
+        return []
+    if RESIDUAL_ITERATIONS not in json.loads((source / TRAINING).read_text(encoding="utf-8")):
+        return []
+    return [
+        f"The residual colors of {source} ({RESIDUAL}) are left out: pictures of the result show its "
+        "materials in the learnt light alone."
+    ]
 
 
 def _copy(source: Path, target: Path) -> None:
@@ -107,7 +122,7 @@ def _copy(source: Path, target: Path) -> None:
             shutil.copyfile(source / name, target / name)
     if (source / TRAINING).exists():
         facts = json.loads((source / TRAINING).read_text(encoding="utf-8"))
-        write_json(target / TRAINING, {name: fact for name, fact in facts.items() if name != _MEASURED})
+        write_json(target / TRAINING, {name: fact for name, fact in facts.items() if name not in _LEFT_OUT})
     if (source / POSES).is_dir():
         # Not by copytree, which sets access and times as well, as a confined job may not.
         for path in (source / POSES).rglob("*"):

@@ -25,6 +25,7 @@ from octasplat.engine.runs.run_folder import (
     ENVIRONMENT_HDR,
     EVENTS,
     HELD_OUT,
+    RESIDUAL_ITERATIONS,
     TRAINING,
     VIEWS,
     dataset_folder_of_run,
@@ -60,6 +61,7 @@ def write_transformed_run_files(
         write_views(target / VIEWS, moved.model_copy(update={"origin_world": origin_world}))
     if (source / TRAINING).exists():
         training = json.loads((source / TRAINING).read_text(encoding="utf-8"))
+        training.pop(RESIDUAL_ITERATIONS, None)
         if "nearest_world" in training:
             training["nearest_world"] = {
                 name: scale * distance for name, distance in training["nearest_world"].items()

@@ -136,8 +136,9 @@ def evaluate_scales(
     gaussians, _ = read_gaussian_ply(output / SCENE, folder=output)
     extent = run_extent(output, dataset.extent)
     shading = finished_shading(
-        output, shown_options(config.train, gaussians), extent, [view.name for view in dataset.views]
-    )
+        output, shown_options(config.train, gaussians), extent, [view.name for view in dataset.views],
+        scene=gaussians, trace=config.train.trace,
+    )  # fmt: skip
     tracer = make_tracer(config.train.trace, threads=threads)
     tracer.build(gaussians, shading.features(gaussians))
     with counted_phase("evaluate", listener, len(dataset.test_indices)) as progress:
@@ -226,6 +227,8 @@ def measure_run(
             shown_options(config.train, gaussians),
             extent,
             [view.name for view in dataset.views] if is_own else (),
+            scene=gaussians,
+            trace=config.train.trace,
         ),
         background=config.evaluation_background,
         run={

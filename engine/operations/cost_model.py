@@ -17,7 +17,14 @@ from octasplat.engine.operations.render_options import PictureOptions
 from octasplat.engine.poses.config import DEFAULT_CONFIG, MAX_IMAGE_SIDE_PX
 from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.runs.result_files import SURFACE_GLB
-from octasplat.engine.train.config import TrainConfig, iteration_count, max_gaussian_count, uses_shared_sort
+from octasplat.engine.train.config import (
+    ITERATIONS_PER_BATCH,
+    KEPT_BATCHES,
+    TrainConfig,
+    iteration_count,
+    max_gaussian_count,
+    uses_shared_sort,
+)
 
 _START_CPU_SECONDS = 16.0
 _FEATURES_CPU_SECONDS_PER_PIXEL = 1.6e-6
@@ -62,6 +69,10 @@ _FITTED_GAUSSIANS = 200_000
 _MATERIAL_RAY_CPU_SECONDS = 2.1e-5
 """For a ray with what it reflects, of a training with materials of so many Gaussians."""
 _MATERIAL_GAUSSIANS = 80_000
+_SHADED_SHARE = 0.5
+"""Of that, forward alone: rays of the fit of residual colors, one batch for several iterations."""
+_SHADED_RAY_BYTES = 100
+"""For a ray of each batch that this fit keeps."""
 _MATERIAL_EVALUATE_CPU_SECONDS_PER_PIXEL = 5.5e-5
 """With four to sixteen rays per pixel and what they reflect: 8 to 10 s per picture of 400 x 400 pixels."""
 _SHARED_SORT_SAVING = 0.6
@@ -185,6 +196,8 @@ def estimate_reconstruction(
     if materials:
         # the largest of both phases: they follow each other
         training = max(training + _MATERIAL_TRAIN_BYTES, _MATERIAL_START_BYTES)
+        if train.materials.residual_share:
+            training += KEPT_BATCHES * train.rays_per_batch * _SHADED_RAY_BYTES
     memory = _START_BYTES + model_bytes(count) + max(training, _PIXEL_BYTES * largest)
     if finds_poses:  # before the training, by a process of its own
         memory = max(memory, _START_BYTES + _MAPPED_BYTES_PER_PHOTOGRAPH * count)
@@ -376,7 +389,10 @@ def _ray_cpu_seconds(train: TrainConfig, gaussians: int) -> float:
     seconds = max(_RAY_CPU_SECONDS * near**_RAY_POWER * far**_FAR_RAY_POWER, _LEAST_RAY_CPU_SECONDS)
     if train.materials.learn:
         lit = float(_MATERIAL_RAY_CPU_SECONDS * (gaussians / _MATERIAL_GAUSSIANS) ** _FAR_RAY_POWER)
-        return lit + float(seconds) if train.loss.edges else lit
+        residual = (train.materials.residual_share or 0.0) * (
+            seconds + _SHADED_SHARE / ITERATIONS_PER_BATCH * lit
+        )
+        return lit + float(seconds if train.loss.edges else 0) + float(residual)
     saved = _SHARED_SORT_SAVING * train.shared_sort_until if uses_shared_sort(train) else 0.0
     return float(seconds * (1 - saved))
 

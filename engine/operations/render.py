@@ -256,16 +256,17 @@ def _render_plain(plan: _RenderPlan, progress: EventListener, threads: int) -> t
     transparent = request.background == "transparent"
     background = background_color("black" if transparent else request.background or source.background)
     learnt = None if request.background else source.learnt  # another color was asked for, or alpha
-    materials = source.materials
+    materials, residual = source.materials, source.residual
     views = None if cameras is not None else (source.viewpoints, source.near_world)
     finished = output.finished_images(
         render_digest(
             source.gaussians, source.settings, background, transparent, cameras, None, views,
             source.trained_rad, None if learnt is None else learnt.rgb_srgb, *output.numbered(shots),
             *(() if materials is None else (materials.settings, materials.light.radiance_linear)),
+            *(() if residual is None else (residual.residual_sh,)),
         )
     )  # fmt: skip
-    shading = materials or learnt or PLAIN_SHADING
+    shading = residual or materials or learnt or PLAIN_SHADING
     tracer = make_tracer(source.settings, threads=threads, build_quality=2)
     tracer.build(source.gaussians, shading.features(source.gaussians))
     paint = scene_render_fn(

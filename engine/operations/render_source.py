@@ -47,8 +47,14 @@ from octasplat.engine.runs.run_folder import (
 )
 from octasplat.engine.shading.background import LearnedBackground
 from octasplat.engine.shading.deferred import DeferredShading
+from octasplat.engine.shading.residual_colors import ResidualColors
 from octasplat.engine.trace.protocol import TraceSettings
-from octasplat.engine.train.shading_factory import ShadingOptions, find_background, find_deferred
+from octasplat.engine.train.shading_factory import (
+    ShadingOptions,
+    find_background,
+    find_deferred,
+    find_residual,
+)
 
 _NO_LIGHT = "a file does not hold the light that its materials were learnt in."
 _SOME_WITHOUT = "some of its Gaussians came from a scene without materials, so that harmonics are shown."
@@ -71,6 +77,7 @@ class RenderSource:
         trained_extent: scene extent of the training, world units.
         learnt: background that the run has learnt.
         materials: shading of the run's materials in the light that it has learnt.
+        residual: the same with the residual colors that it has learnt.
         photographs: where the photographs were taken from, at their full size, if that was asked for.
         origin_world: where the scene has its origin in the coordinates of its user, see
             :mod:`octasplat.engine.core.local_origin`.
@@ -86,6 +93,7 @@ class RenderSource:
     trained_extent: float | None = None
     learnt: LearnedBackground | None = None
     materials: DeferredShading | None = None
+    residual: ResidualColors | None = None
     photographs: Viewpoints | None = None
     origin_world: Origin = NO_ORIGIN
 
@@ -165,7 +173,7 @@ def read_render_source(
     elif options.materials is None and config.train.materials.learn and has_materials(gaussians):
         progress(Noted(f"{source}: {_SOME_WITHOUT}"))
     extent = run_extent(source, viewpoints.extent)
-    learnt = finished_shading(source, options, extent)
+    learnt = finished_shading(source, options, extent, scene=gaussians, trace=config.train.trace)
     facts = read_metadata(source)
     return RenderSource(
         gaussians=gaussians,
@@ -178,6 +186,7 @@ def read_render_source(
         trained_extent=extent,
         learnt=find_background(learnt),
         materials=find_deferred(learnt),
+        residual=find_residual(learnt),
         photographs=photographs,
         origin_world=facts.origin_world,
     )

@@ -39,7 +39,7 @@ _UNCHANGED_SINCE = dict[str | bytes, tuple[int, int]]
 _DATASET_FOLDERS = ("input", *SCENE_FOLDERS)
 _RUN_FILES = (
     "config.json", "events.jsonl", "held_out.json", "views.json", "training.json", "plan.json", "scene.ply",
-    "edits.json", "environment.hdr", "environment.exr", "background.exr", "georeference.json",
+    "edits.json", "environment.hdr", "environment.exr", "background.exr", "residual.npz", "georeference.json",
 )  # fmt: skip
 _RUN_FOLDERS = ("cache", "checkpoints", "poses")
 

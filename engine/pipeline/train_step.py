@@ -29,25 +29,28 @@ from octasplat.engine.pipeline.start_scene import has_start, started_state
 from octasplat.engine.render.environment_files import write_background_map, write_environment
 from octasplat.engine.render.shots import training_pixel_angle
 from octasplat.engine.runs.config import resolve_config
+from octasplat.engine.runs.residual_file import write_residual
 from octasplat.engine.runs.run_folder import (
     BACKGROUND,
     CHECKPOINTS,
     ENVIRONMENT_EXR,
     ENVIRONMENT_HDR,
     PLAN,
+    RESIDUAL_ITERATIONS,
     SCENE,
     TRAINING,
 )
 from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.shading.recipes import material_shading
-from octasplat.engine.train.config import TrainConfig, iteration_count
+from octasplat.engine.train.config import TrainConfig, iteration_count, residual_iteration_count
 from octasplat.engine.train.initialization.initial_gaussians import initial_train_state
 from octasplat.engine.train.loop.checkpoint import (
     load_latest_checkpoint,
     remove_former_checkpoints,
     run_fingerprint,
 )
+from octasplat.engine.train.loop.residual_fit import fit_residual_colors
 from octasplat.engine.train.loop.state import MinScale, TrainState
 from octasplat.engine.train.loop.time_budget import make_plan, read_plan, write_plan
 from octasplat.engine.train.loop.trainer import Trainer
@@ -115,10 +118,27 @@ def _train(run: ReconstructionRun, clock: PhaseClock) -> FlatGaussians:
     trainer = _make_trainer(run, config, nearest_world, clock)
     gaussians = trainer.run()
     _write_learnt_light(trainer.shading, gaussians, run.output, run.progress)
+    fitted = _fit_residual(run, trainer, gaussians)
     _write_training_record(
-        trainer, run.dataset, nearest_world, clock, run.output, keeps_near_free=config.camera_clearance > 0
-    )
+        trainer, run.dataset, nearest_world, clock, run.output,
+        keeps_near_free=config.camera_clearance > 0, residual_iterations=fitted,
+    )  # fmt: skip
     return gaussians
+
+
+def _fit_residual(run: ReconstructionRun, trainer: Trainer, gaussians: FlatGaussians) -> int:
+    """Fit and write residual colors where a training with materials asks for them; return the iterations."""
+    config, done = trainer.config, trainer.state.iteration
+    if not (iterations := residual_iteration_count(config, done)):
+        return 0
+    run.progress(Noted(f"Fitting residual colors, {iterations:,} iterations with all else kept."))
+    residual_sh = fit_residual_colors(
+        gaussians, trainer.dataset, trainer.shading, config,
+        iterations=iterations, excluded_views=trainer.state.excluded_views, threads=run.threads,
+        should_stop=run.should_stop,
+    )  # fmt: skip
+    write_residual(run.output, residual_sh)
+    return iterations
 
 
 def _train_in_blocks(run: ReconstructionRun, count: int) -> FlatGaussians:
@@ -223,6 +243,7 @@ def _write_training_record(
     output: Path,
     *,
     keeps_near_free: bool,
+    residual_iterations: int,
 ) -> None:
     """Write the facts on a finished training that later steps and commands need."""
     record: dict[str, object] = {"seconds": clock.stop(), "iterations": trainer.state.iteration}
@@ -232,6 +253,8 @@ def _write_training_record(
         record["training_views"] = trainer.views.as_dict()
     if trainer.poses is not None:
         record["poses"] = trainer.poses.as_dict()
+    if residual_iterations:
+        record[RESIDUAL_ITERATIONS] = residual_iterations
     if keeps_near_free:
         record["taken_near"] = trainer.state.pruned_near_cameras
     _write_record(record, dataset, trainer.shading, nearest_world, output)

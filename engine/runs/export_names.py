@@ -12,6 +12,7 @@ _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 _TAKEN = frozenset(
     {"scene.ply", "config.json", "held_out.json", "views.json", "events.jsonl", "metrics.json", "report.html"}
     | {"training.json", "plan.json", "environment.hdr", "environment.exr", "background.exr", "edits.json"}
+    | {"residual.npz"}
     | {"georeference.json"}
     | {"renders", "layers", "cache", "checkpoints", "poses", "blocks", "start"}
 )  # fmt: skip

@@ -4,10 +4,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from octasplat.engine.core.threads import threads_in_use
 from octasplat.engine.gaussians.materials import has_materials, is_material_known
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.render.environment_files import read_background_map, read_environment
 from octasplat.engine.runs.config import read_config
+from octasplat.engine.runs.residual_file import read_residual
 from octasplat.engine.runs.run_folder import (
     BACKGROUND,
     CONFIG,
@@ -19,9 +21,13 @@ from octasplat.engine.runs.run_folder import (
 )
 from octasplat.engine.shading.deferred import DeferredShading
 from octasplat.engine.shading.protocol import ShadingModel
+from octasplat.engine.shading.residual_colors import ResidualColors, with_residual
+from octasplat.engine.trace.factory import make_tracer
+from octasplat.engine.trace.protocol import TraceSettings
 from octasplat.engine.train.config import TrainConfig
 from octasplat.engine.train.shading_factory import (
     ShadingOptions,
+    add_residual,
     find_background,
     find_deferred,
     find_exposures,
@@ -61,9 +67,15 @@ def learned_materials(output: Path, gaussians: FlatGaussians) -> DeferredShading
 
 
 def finished_shading(
-    output: Path, options: ShadingOptions, extent_world: float, view_names: Sequence[str] = ()
+    output: Path,
+    options: ShadingOptions,
+    extent_world: float,
+    view_names: Sequence[str] = (),
+    *,
+    scene: FlatGaussians | None = None,
+    trace: TraceSettings | None = None,
 ) -> ShadingModel:
-    """Return the shading model of a finished run with its environment, background and exposures.
+    """Return the shading model of a finished run with its environment, background, residual and exposures.
 
     Args:
         output: folder of the run.
@@ -71,6 +83,9 @@ def finished_shading(
         extent_world: of the scene.
         view_names: the photographs of the run, by whose exposures its views are shown; without any the
             model has no exposures.
+        scene: the run's own, whose residual colors are added to materials in the learnt light; None leaves
+            them out.
+        trace: where rays that show residual colors are cut off.
 
     Raises:
         ConfigError: the run learnt one of these and its file is missing or damaged.
@@ -82,6 +97,11 @@ def finished_shading(
         deferred.light.set_radiance(read_environment(run_environment(output)))
     if (background := find_background(shading)) is not None:
         background.set_map(read_background_map(output / BACKGROUND))
+    residual_sh = None if deferred is None or scene is None else read_residual(output, scene)
+    if deferred is not None and scene is not None and residual_sh is not None:
+        tracer = make_tracer(trace, threads=threads_in_use())
+        tracer.build(with_residual(scene, residual_sh))
+        shading = add_residual(shading, ResidualColors(deferred, tracer, residual_sh))
     if known is not None and (exposures := find_exposures(shading)) is not None:
         exposures.load_known(view_names, known)
     return shading

@@ -42,6 +42,10 @@ ENVIRONMENT_HDR, ENVIRONMENT_EXR = "environment.hdr", "environment.exr"
 """The learnt light, for programs that show it and as it was learnt: an HDR has one exponent for all channels
 of a pixel, so that a dark channel beside a bright one is coarse."""
 BACKGROUND = "background.exr"
+RESIDUAL = "residual.npz"
+"""Harmonics of the residual colors of a run with materials, row by row as in its scene."""
+RESIDUAL_ITERATIONS = "residual_iterations"
+"""Key of the record of a training that has fitted residual colors."""
 EVALUATIONS = "on"
 """Below it are the measures on photographs of other folders, a folder each."""
 _COMPARED_PHOTOGRAPHS = 8

@@ -27,7 +27,7 @@ class MaterialSettings(Settings):
     """Settings of learnt materials and environments; shares of the training are of all its iterations."""
 
     former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.MATERIALS
-    later_settings: ClassVar[frozenset[str]] = frozenset({"fallback", "dark_metal_weight"})
+    later_settings: ClassVar[frozenset[str]] = frozenset({"fallback", "dark_metal_weight", "residual_share"})
 
     learn: Annotated[bool, ADVANCED] = Field(
         False,
@@ -224,6 +224,15 @@ class MaterialSettings(Settings):
     )
     normal_propagation: Annotated[bool, EXPERIMENTAL] = Field(
         False, description="Hand normals on to neighbours now and then, those of what reflects best first."
+    )
+
+    residual_share: Annotated[float | None, Unit("share of iterations"), ADVANCED] = Field(
+        None,
+        ge=0,
+        le=10,
+        description="After the training, so many times its iterations fit residual colors: harmonics of what "
+        "materials and light do not explain, all else kept. Pictures in the learnt light add them; "
+        "relighting, edits and stages do not. 0 leaves them out.",
     )
 
     @field_validator("up_world")

@@ -10,6 +10,7 @@ from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.shading.plain import PLAIN_SHADING
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.shading.recipes import material_shading
+from octasplat.engine.shading.residual_colors import ResidualColors
 from octasplat.engine.train.config import BACKGROUND_SMOOTHNESS, TrainConfig
 
 
@@ -92,8 +93,20 @@ def find_background(shading: ShadingModel) -> LearnedBackground | None:
     return shading if isinstance(shading, LearnedBackground) else None
 
 
+def add_residual(shading: ShadingModel, residual: ResidualColors) -> ShadingModel:
+    """Return the model with residual colors on its materials, below its exposures."""
+    return shading.over(residual) if isinstance(shading, ExposureModel) else residual
+
+
+def find_residual(shading: ShadingModel) -> ResidualColors | None:
+    """Return the residual colors that a shading model is or contains, or None."""
+    if isinstance(shading, ExposureModel):
+        return find_residual(shading.inner)
+    return shading if isinstance(shading, ResidualColors) else None
+
+
 def find_deferred(shading: ShadingModel) -> DeferredShading | None:
     """Return the model of materials that a shading model is or contains, or None."""
-    if isinstance(shading, ExposureModel):
+    if isinstance(shading, ExposureModel | ResidualColors):
         return find_deferred(shading.inner)
     return shading if isinstance(shading, DeferredShading) else None

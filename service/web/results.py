@@ -248,6 +248,10 @@ _USE_BY_NAME = {
     "environment.hdr": (_SCENE, "Blender and whatever takes HDR light: what lit the photographs, all around"),
     "environment.exr": (_SCENE, "the same light as it was learnt, to the last digit; octasplat itself"),
     "background.exr": (_SCENE, "Blender and whatever takes EXR maps: the sky, and what else is far away"),
+    "residual.npz": (
+        _RECORDS,
+        "octasplat itself: what materials and light do not explain of the photographs, by direction",
+    ),
     "edits.json": (_RECORDS, "a text editor: what was changed since the training"),
     "views.json": (_RECORDS, "octasplat render and surface, which need no photographs then"),
     "georeference.json": (_RECORDS, "a text editor: where the scene lies, how large it is, and what is up"),

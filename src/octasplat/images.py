@@ -19,6 +19,7 @@ from octasplat.scenes import Scene
 
 if TYPE_CHECKING:
     from octasplat.engine.shading.deferred import DeferredShading
+    from octasplat.engine.shading.protocol import ShadingModel
     from octasplat.engine.trace.protocol import Tracer
 
 Background = Literal["black", "white"] | tuple[float, float, float]
@@ -150,12 +151,30 @@ def render(
         rays,
         behind,
         trained_rad=scene.facts.pixel_rad,
-        shading=materials or PLAIN_SHADING,
+        shading=PLAIN_SHADING if materials is None else _with_residual(scene, materials, threads),
         gives_radiance=materials is not None,
     )
     return Image(
         rendered.rgb_srgb, rendered.depth, rendered.normal_world, rendered.alpha, scene, rays, threads
     )
+
+
+def _with_residual(scene: Scene, materials: "DeferredShading", threads: int) -> "ShadingModel":
+    """Return materials in the learnt light with the residual colors of the scene, where it has any."""
+    from octasplat.engine.shading.residual_colors import ResidualColors, with_residual
+    from octasplat.engine.trace.factory import make_tracer
+
+    residual_sh = scene.residual_sh
+    if residual_sh is None:
+        return materials
+    if len(residual_sh) != len(scene):
+        raise ConfigError(
+            f"scene.residual_sh: {len(residual_sh):,} rows for {len(scene):,} Gaussians; set it to None to "
+            "show materials alone."
+        )
+    tracer = make_tracer(scene.trace_settings, threads=threads)
+    tracer.build(with_residual(scene.gaussians, residual_sh))
+    return ResidualColors(materials, tracer, residual_sh)
 
 
 def _background_color(background: Background) -> Float32[np.ndarray, "3"]:

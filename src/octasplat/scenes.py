@@ -50,6 +50,7 @@ class Scene:
         materials: "DeferredShading | None" = None,
         trained_with: "TraceSettings | None" = None,
         viewpoints: "Viewpoints | None" = None,
+        residual_sh: Float32[np.ndarray, "n k 3"] | None = None,
     ) -> None:
         """Take over the engine's Gaussians; :meth:`from_arrays` makes a scene of plain arrays.
 
@@ -59,12 +60,15 @@ class Scene:
             materials: shading of its materials in the light that a run has learnt.
             trained_with: how a run has traced it; None where that is not known.
             viewpoints: where its photographs were taken from; None where that is not known.
+            residual_sh: harmonics of what its materials in that light do not explain of the photographs;
+                pictures in that light add it. None leaves it out, as is right once materials were changed.
         """
         self.gaussians = gaussians
         self.facts = facts
         self.materials = materials
         self.trained_with = trained_with
         self.viewpoints = viewpoints
+        self.residual_sh = residual_sh
 
     @classmethod
     def from_arrays(
@@ -208,14 +212,16 @@ class Scene:
         rows = index if isinstance(index, slice) else np.atleast_1d(_as_numpy(index))
         if len(self) and not isinstance(rows, slice) and rows.size == 0:
             rows = np.zeros(0, np.int64)  # of an empty list, which has no type
-        return self._with(self.gaussians.select(rows))
+        residual_sh = None if self.residual_sh is None else self.residual_sh[rows]
+        return self._with(self.gaussians.select(rows), residual_sh)
 
     def copy(self) -> "Scene":
         """Return an independent copy."""
-        return self._with(self.gaussians.copy())
+        residual_sh = None if self.residual_sh is None else self.residual_sh.copy()
+        return self._with(self.gaussians.copy(), residual_sh)
 
-    def _with(self, gaussians: FlatGaussians) -> "Scene":
-        return Scene(gaussians, self.facts, self.materials, self.trained_with, self.viewpoints)
+    def _with(self, gaussians: FlatGaussians, residual_sh: Float32[np.ndarray, "n k 3"] | None) -> "Scene":
+        return Scene(gaussians, self.facts, self.materials, self.trained_with, self.viewpoints, residual_sh)
 
     @property
     def trace_settings(self) -> "TraceSettings":
@@ -385,6 +391,7 @@ def read_scene(path: Path, progress: EventListener, *, drop_invalid: bool = Fals
     from octasplat.engine.operations.scene_io import open_scene
     from octasplat.engine.runs.config import read_config
     from octasplat.engine.runs.finished_shading import learned_materials
+    from octasplat.engine.runs.residual_file import read_residual
     from octasplat.engine.runs.run_folder import CONFIG, VIEWS, is_full_run, run_viewpoints
 
     gaussians = open_scene(path, progress, drop_invalid=drop_invalid)
@@ -392,7 +399,8 @@ def read_scene(path: Path, progress: EventListener, *, drop_invalid: bool = Fals
     settings = read_config(path / CONFIG).train.trace if is_full_run(path) else None
     # Runs of old keep no cameras, and their photographs may be anywhere.
     viewpoints = run_viewpoints(path) if settings is not None and (path / VIEWS).exists() else None
-    return Scene(gaussians, read_metadata(path), materials, settings, viewpoints)
+    residual_sh = None if materials is None else read_residual(path, gaussians)
+    return Scene(gaussians, read_metadata(path), materials, settings, viewpoints, residual_sh)
 
 
 def save(scene: Scene, path: PathLike) -> Path:

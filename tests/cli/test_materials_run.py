@@ -79,7 +79,7 @@ def test_materials_run_resumes_to_same_bytes(
     running.communicate(timeout=120)
     result = octasplat(*command, "--resume")
     assert result.exit_code == 0, result.output
-    for name in ("scene.ply", "environment.hdr", "environment.exr"):
+    for name in ("scene.ply", "environment.hdr", "environment.exr", "residual.npz"):
         assert (output / name).read_bytes() == (materials_run / name).read_bytes(), name
 
 
@@ -93,6 +93,36 @@ def test_render_of_materials_run_is_shaded_as_its_evaluation(materials_run, octa
     result = octasplat("render", materials_run, "--shading", "harmonics", "-o", tmp_path / "plain")
     assert result.exit_code == 0, result.output
     assert (tmp_path / "plain" / rendered[0].name).read_bytes() != rendered[0].read_bytes()
+
+
+def test_residual_colors_are_shown_in_the_learnt_light_alone(materials_run, octasplat, tmp_path):
+    run = shutil.copytree(materials_run, tmp_path / "run")
+    residual = run / "residual.npz"
+    with np.load(residual) as stored:
+        assert len(stored["sh"]) == len(read_gaussian_ply(run / "scene.ply")[0])
+    camera = ("--camera", 0, -0.5, -2.5, "--width", 32, "--height", 24)
+    light = ("--environment", run / "environment.hdr")
+
+    def picture(name, *command):
+        result = octasplat(*command, *camera, "-o", tmp_path / f"{name}.png")
+        assert result.exit_code == 0, result.output
+        return read_image(tmp_path / f"{name}.png")
+
+    shown, relit = picture("shown", "render", run), picture("relit", "relight", run, *light)
+    # an edit leaves them out, and says so
+    result = octasplat("crop", run, "--box", -100, -100, -100, 100, 100, 100, "-o", tmp_path / "cropped")
+    assert result.exit_code == 0 and "residual colors" in " ".join(result.output.split())
+    cropped = picture("cropped", "render", tmp_path / "cropped")
+    result = octasplat("crop", tmp_path / "cropped", "--box", -99, -99, -99, 99, 99, 99, "-o", tmp_path / "c")
+    assert result.exit_code == 0 and "residual colors" not in " ".join(result.output.split())
+    whole = residual.read_bytes()
+    residual.write_bytes(whole[:100])
+    result = octasplat("render", run, *camera, "-o", tmp_path / "damaged.png")
+    assert result.exit_code == 1 and "residual.npz cannot be read" in " ".join(result.output.split())
+    residual.unlink()
+    np.testing.assert_array_equal(picture("without", "render", run), cropped)
+    np.testing.assert_array_equal(picture("relit again", "relight", run, *light), relit)
+    assert np.abs(shown - cropped).max() > 0.01
 
 
 @pytest.mark.exhaustive

@@ -16,10 +16,11 @@ from octasplat.workers.worker.start_files import START_RECORD
 from octasplat.workers.worker.task import BLOCKS_FOLDER, POSES_FOLDER, RUN_FOLDER
 
 _CHECKPOINT = re.compile(r"run/checkpoints/iteration_\d+\.npz")
+_RESIDUAL = "run/residual.npz"
 _CHECKPOINT_FILES = (
     "run/config.json", "run/held_out.json", "run/views.json", "run/events.jsonl", "run/training.json",
     "run/plan.json", "run/georeference.json", "run/scene.ply", "run/checkpoints/best.npz",
-    "run/background.exr", "run/environment.exr", "run/environment.hdr",
+    "run/background.exr", "run/environment.exr", "run/environment.hdr", _RESIDUAL,
     "run/start/best.npz", "run/start/views.json", START_RECORD,
 )  # fmt: skip
 _SEARCH_FILES = tuple(
@@ -59,7 +60,7 @@ def checkpoint_files(folder: UntrustedFolder, stage: str, own_block: str | None)
         return pieces
     names += [*poses, *pieces]
     if "run/scene.ply" in names:  # the training is done, its checkpoints are of no more use
-        return [name for name in names if not name.endswith(".npz")]
+        return [name for name in names if name == _RESIDUAL or not name.endswith(".npz")]
     newest = max((name for name in checkpoints if _CHECKPOINT.fullmatch(name)), default=None)
     if newest is not None:
         return [*names, newest]

@@ -5,12 +5,16 @@ Imports neither torch nor numba.
 
 from octasplat.engine.train.config.densify import McmcConfig, RedisplatsConfig
 from octasplat.engine.train.config.derived import (
+    ITERATIONS_PER_BATCH,
+    KEPT_BATCHES,
     MAX_PLANNED_ITERATIONS,
+    RESIDUAL_ITERATION_COST,
     iteration_count,
     max_gaussian_count,
     min_tile_side_px,
     ray_patch_side_px,
     rebuild_interval,
+    residual_iteration_count,
     uses_shared_sort,
     with_depth_weight,
 )
@@ -28,8 +32,11 @@ from octasplat.engine.train.config.train import TrainConfig
 
 __all__ = [
     "BACKGROUND_SMOOTHNESS",
+    "ITERATIONS_PER_BATCH",
+    "KEPT_BATCHES",
     "MAX_PLANNED_ITERATIONS",
     "OUTLIER_VIEWS_FROM",
+    "RESIDUAL_ITERATION_COST",
     "SURFACE_DEPTH_NORMAL_WEIGHT",
     "VISIBILITY_RAY_MARGIN",
     "Background",
@@ -45,6 +52,7 @@ __all__ = [
     "preset",
     "ray_patch_side_px",
     "rebuild_interval",
+    "residual_iteration_count",
     "uses_shared_sort",
     "with_depth_weight",
     "with_materials",

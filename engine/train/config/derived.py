@@ -24,6 +24,13 @@ MIN_PATCHES_ACROSS = 15
 """Patches of rays along the longest side of a view, so that each covers a small angle."""
 PATCH_PIXELS_PER_GAUSSIAN_PIXEL = 6
 """Pixels that a patch spans for each pixel that a Gaussian covers, so that its rays meet the same ones."""
+ITERATIONS_PER_BATCH = 4
+"""Iterations of the fit of residual colors for each batch that is drawn and shaded; the others look at kept
+ones again, which costs a fourth."""
+KEPT_BATCHES = 256
+"""So many of them, the last ones."""
+RESIDUAL_ITERATION_COST = 0.17
+"""Of an iteration with materials, what one of that fit takes, see ``docs/notes/materials.md``."""
 GAUSSIANS_PER_REBUILD_INTERVAL = 500_000
 """Gaussians for each of which so many the interval between rebuilds is taken once more."""
 
@@ -114,3 +121,10 @@ def rebuild_interval(rebuild_every: int, gaussians: int) -> int:
     A rebuild takes time for every Gaussian, an iteration only for those that its rays meet.
     """
     return rebuild_every * (1 + gaussians // GAUSSIANS_PER_REBUILD_INTERVAL)
+
+
+def residual_iteration_count(config: TrainConfig, iterations: int) -> int:
+    """Return how many iterations fit residual colors after a training of so many; 0: there are none."""
+    if not config.materials.learn:
+        return 0
+    return round((config.materials.residual_share or 0.0) * iterations)

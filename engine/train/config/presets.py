@@ -21,6 +21,8 @@ EDGE_WEIGHT = 1.0
 SHORT_DARK_METAL_WEIGHT = 0.02
 """Its ``materials.dark_metal_weight`` in such a training, in which metallic does not get far from where it
 begins. In a long one rough metals that are seen too dark lose by it."""
+SHORT_RESIDUAL_SHARE, LONG_RESIDUAL_SHARE = 1.6, 0.2
+"""Its ``materials.residual_share`` in short and in long trainings."""
 EDGE_NORMAL_WEIGHT = 0.05
 """Its ``materials.normal_weight`` and ``depth_normal_weight``: rays for edges move the Gaussians, too."""
 
@@ -64,6 +66,7 @@ def with_materials(config: TrainConfig, recipe: Recipe = "split_sum") -> TrainCo
             normal_weight=EDGE_NORMAL_WEIGHT,
             depth_normal_weight=EDGE_NORMAL_WEIGHT,
             dark_metal_weight=SHORT_DARK_METAL_WEIGHT if is_short else None,
+            residual_share=SHORT_RESIDUAL_SHARE if is_short else LONG_RESIDUAL_SHARE,
         )
     densify = McmcConfig(
         copies="area",

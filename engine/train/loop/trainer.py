@@ -69,6 +69,8 @@ class Trainer:
 
     Attributes:
         state: the present state.
+        config: its settings, with the rates of its length.
+        dataset: the photographs, at refined poses where these are refined.
         schedule: when what happens; another one from where it is decided to end early.
         shading: the shading model.
         views: how well the exported Gaussians show the training views; None before the end.
@@ -105,7 +107,7 @@ class Trainer:
         self._on_step = on_step
         self._min_scale = min_scale
         self._allowed_region = AllowedRegion(camera_clearance, view_frusta)
-        self._config = config
+        self.config = config
         self._folder = folder
         self._fingerprint = fingerprint
         self._progress = progress
@@ -123,13 +125,13 @@ class Trainer:
                 self._pose_refiner.dataset.set_corrections(state.pose_corrections)
             else:
                 state.pose_corrections = np.zeros((len(dataset.views), 6))
-        self._dataset = dataset
+        self.dataset = dataset
         self._batches = BatchSource(dataset, BatchOptions.from_config(config, dataset), observed=given)
         pixels, valid = self._batches.sampler.pixel_count, valid_pixel_fraction(dataset)
         # its length first: rates and the strategy depend on it
         self.schedule = Schedule.from_config(config, iteration_count(config, pixels, valid))
         rates = config.lr.scaled_for(self.schedule.iterations)
-        self._config = config = config.model_copy(update={"lr": rates})
+        self.config = config = config.model_copy(update={"lr": rates})
         densifier = make_densifier(
             config.densify,
             iterations=self.schedule.iterations,
@@ -208,7 +210,7 @@ class Trainer:
             progress = schedule.training_progress(state.iteration)
             step = train_step(
                 state, batch, components,
-                loss=self._config.loss, lr=self._config.lr, min_blend_weight=self._config.min_blend_weight,
+                loss=self.config.loss, lr=self.config.lr, min_blend_weight=self.config.min_blend_weight,
                 training_progress=progress, extent=self._extent,
             )  # fmt: skip
             is_stale = schedule.may_densify(state.iteration) and self._update_gaussians()
@@ -225,7 +227,7 @@ class Trainer:
 
     def _decay_opacities(self) -> None:
         """Take a little of all opacities in the first part of the training, where that is asked for."""
-        factor, gaussians = self._config.opacity_decay, self.state.gaussians
+        factor, gaussians = self.config.opacity_decay, self.state.gaussians
         if factor is not None and self.schedule.training_progress(self.state.iteration) <= DECAY_UNTIL:
             gaussians.opacity_logits = decayed_logits(gaussians.opacity_logits, factor)
 
@@ -238,7 +240,7 @@ class Trainer:
             if self._pose_refiner is not None:  # the Gaussians of the best state belong to its poses
                 self._pose_refiner.dataset.set_corrections(state.pose_corrections)
             tracer.build(gaussians, shading.features(gaussians))
-        estimate_untrained_exposures(self._dataset, self._background_srgb, tracer, shading)
+        estimate_untrained_exposures(self.dataset, self._background_srgb, tracer, shading)
         self.views = self._outlier_detector.report(tracer, shading, state.excluded_views)
         if (warning := self.views.warning()) is not None:
             self._progress(Warned(warning))
@@ -262,8 +264,8 @@ class Trainer:
     def _make_tracer(self) -> Tracer:
         """Return a tracer for the next iteration; its boxes leave room for moves between rebuilds."""
         sort = "packet" if self.schedule.uses_shared_sort(self.state.iteration) else "ray"
-        settings = self._config.trace.model_copy(update={"sort": sort})
-        tracer = make_tracer(settings, threads=self._threads, box_padding=self._config.box_padding)
+        settings = self.config.trace.model_copy(update={"sort": sort})
+        tracer = make_tracer(settings, threads=self._threads, box_padding=self.config.box_padding)
         if self._fixed_gaussians is None:
             return tracer
         return PartlyFixedTracer(tracer, self._fixed_gaussians, self._traced_folder)
@@ -285,7 +287,7 @@ class Trainer:
         """Turn Gaussians so that normals point outwards, where that is due; again, it changes nothing."""
         state, tracer = self.state, self._components.tracer
         if self.schedule.is_orientation_due(state.iteration):
-            flipped_ids = orient_normals(state.gaussians, self._dataset, self._dataset.train_indices, tracer)
+            flipped_ids = orient_normals(state.gaussians, self.dataset, self.dataset.train_indices, tracer)
             state.adam.reset(flipped_ids)  # moments belong to the former axes
             tracer.refresh(flipped_ids)
 
@@ -325,7 +327,7 @@ class Trainer:
     def _exclude_outlier_views(self) -> None:
         """Find views that do not fit the others, and train without them from here on."""
         state, done = self.state, self.state.iteration
-        if not (self._config.exclude_outlier_views and self.schedule.is_outlier_check_due(done)):
+        if not (self.config.exclude_outlier_views and self.schedule.is_outlier_check_due(done)):
             return
         outliers = self._outlier_detector.find(
             self._components.tracer, self._components.shading, state.excluded_views
@@ -343,7 +345,7 @@ class Trainer:
 
     def _stop_early(self) -> None:
         """End the training early where it hardly gains any more."""
-        state, schedule, min_gain_db = self.state, self.schedule, self._config.early_stopping_db
+        state, schedule, min_gain_db = self.state, self.schedule, self.config.early_stopping_db
         if schedule.early_stop_at is not None or not has_converged(
             state.probes, schedule.iterations, min_gain_db
         ):
@@ -377,7 +379,7 @@ class Trainer:
         Not while states are averaged, which would have to begin anew: at the end they are all removed.
         """
         done = self.state.iteration
-        if done % self._config.densify.interval or self.schedule.is_averaging(done):
+        if done % self.config.densify.interval or self.schedule.is_averaging(done):
             return False
         return self._allowed_region.hide_outside(self.state)
 
@@ -408,7 +410,7 @@ class Trainer:
                 loss=step.loss.value,
                 psnr=psnr_from_mse(state.running_mse),
                 gaussians=len(state.gaussians),
-                rays_per_second=self._config.rays_per_batch / pace_s,
+                rays_per_second=self.config.rays_per_batch / pace_s,
                 hits_per_ray=step.hits_per_ray,
                 seconds=watch.seconds,
                 seconds_left=pace_s * (total - state.iteration),

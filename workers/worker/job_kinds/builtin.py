@@ -26,6 +26,7 @@ from octasplat.workers.worker.job_kinds.scene_kinds import (
     EDITS_FILE,
     EXACT_LIGHT_FILE,
     LIGHT_FILE,
+    RESIDUAL_FILE,
     RUN_FILES,
     ExportKind,
     ImportKind,
@@ -70,7 +71,7 @@ BUILTIN_KINDS: tuple[JobKind[Any], ...] = (
         stages=("evaluate",),
         source_files=(
             *RUN_FILES,
-            *(LIGHT_FILE, EXACT_LIGHT_FILE, BACKGROUND_FILE, EDITS_FILE, GEOREFERENCE_FILE),
+            *(LIGHT_FILE, EXACT_LIGHT_FILE, RESIDUAL_FILE, BACKGROUND_FILE, EDITS_FILE, GEOREFERENCE_FILE),
         ),
         reports_stages=True,
     ),
@@ -78,7 +79,7 @@ BUILTIN_KINDS: tuple[JobKind[Any], ...] = (
     RenderKind(
         RENDER,
         title="New views of the scene of a reconstruction, as a video or images",
-        source_files=(*RUN_FILES[:4], LIGHT_FILE, EXACT_LIGHT_FILE, BACKGROUND_FILE),
+        source_files=(*RUN_FILES[:4], LIGHT_FILE, EXACT_LIGHT_FILE, RESIDUAL_FILE, BACKGROUND_FILE),
     ),
     RelightKind(
         RELIGHT,
