@@ -6,7 +6,7 @@ vertex attributes that they do not know or stop at the raw bytes.
 
 import json
 import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -326,16 +326,26 @@ def channel_extras(widths: Mapping[str, int]) -> dict[str, object]:
     return {CHANNELS: dict(widths)} if widths else {}
 
 
-def declared_channel_attributes(document: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
-    """Return the channels that a file's ``extras`` name, with their attributes in lower case without _."""
+def declared_channel_attributes(
+    document: Mapping[str, Any], columns: Collection[str]
+) -> dict[str, tuple[str, ...]]:
+    """Return the channels that a file's ``extras`` name, with their attributes in lower case without _.
+
+    Args:
+        document: JSON of the file.
+        columns: attributes of a primitive, likewise. A channel is one vector there, as of splats, or a scalar
+            for each of its numbers, as of octagons.
+    """
     found = asset_extras(document).get(CHANNELS, {})
     widths = {name: int(width) for name, width in found.items() if width > 0}
     if sum(widths.values()) > MAX_CHANNEL_COLUMNS:
         raise ValueError(f"its channels have more than {MAX_CHANNEL_COLUMNS} columns")
-    columns: dict[str, list[str]] = {}
-    for attribute in channel_attributes(widths):
-        columns.setdefault(attribute.channel, []).append(attribute.semantic[1:].lower())
-    return {name: tuple(own) for name, own in columns.items()}
+    return {
+        name: (name.lower(),)
+        if name.lower() in columns
+        else tuple(column.lower() for column in column_names(name, width))
+        for name, width in widths.items()
+    }
 
 
 def json_bytes(document: dict[str, object]) -> bytes:
