@@ -240,6 +240,18 @@ def read_glb_metadata(path: Path) -> SceneMetadata:
         raise SceneFileError(f"{path}: its glTF is damaged or not understood ({error}).") from error
 
 
+def is_own_glb(path: Path) -> bool:
+    """Return whether octasplat wrote a GLB, and no other program since.
+
+    Raises:
+        SceneFileError: the file is no GLB, or is damaged.
+    """
+    match GlbFile(path).document:
+        case {"asset": {"generator": "octasplat"}}:
+            return True
+    return False
+
+
 def _node_matrix(node: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T  # glTF stores columns
