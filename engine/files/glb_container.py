@@ -47,7 +47,7 @@ MAX_PRIMITIVES = 100_000
 MAX_CHANNEL_COLUMNS = 10_000
 CHANNELS = "octasplat_channels"
 ALL_ROWS = slice(None)
-GLB_READ_ERRORS = (KeyError, IndexError, TypeError, ValueError, AttributeError)
+GLB_READ_ERRORS = (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError)
 """What reading a document that says nonsense may raise."""
 
 
