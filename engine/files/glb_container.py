@@ -240,15 +240,19 @@ def read_glb_metadata(path: Path) -> SceneMetadata:
         raise SceneFileError(f"{path}: its glTF is damaged or not understood ({error}).") from error
 
 
-def is_own_glb(path: Path) -> bool:
-    """Return whether octasplat wrote a GLB, and no other program since.
+def is_half_turned(path: Path) -> bool:
+    """Return whether octasplat wrote the meshes of a GLB, and no other program since, y up by a half turn.
+
+    What is lit is turned as its light asks.
 
     Raises:
         SceneFileError: the file is no GLB, or is damaged.
     """
     match GlbFile(path).document:
-        case {"asset": {"generator": "octasplat"}}:
-            return True
+        case {"asset": {"generator": "octasplat"}, "nodes": [{"rotation": list() as rotation, **root}, *_]}:
+            extras = root.get("extras")
+            is_upright = isinstance(extras, Mapping) and TURN_KEY in extras
+            return is_upright or rotation == HALF_TURN_ABOUT_X
     return False
 
 

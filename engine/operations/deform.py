@@ -17,7 +17,7 @@ from octasplat.engine.core.threads import use_threads
 from octasplat.engine.edit.axes import AXIS_ROTATIONS, Axes, default_axes
 from octasplat.engine.edit.reports import DeformReport
 from octasplat.engine.files import ImportedMesh, read_mesh, read_metadata
-from octasplat.engine.files.glb_container import is_own_glb
+from octasplat.engine.files.glb_container import is_half_turned
 from octasplat.engine.operations.base import (
     Operation,
     Options,
@@ -149,8 +149,8 @@ def _axes_of_meshes(request: DeformRequest) -> Axes:
     """Return the turn of the meshes; where nobody says it, that of a GLB of ours, or none."""
     if request.axes != "auto":
         return request.axes
-    is_own = request.proxy.suffix.lower() == ".glb" and is_own_glb(request.proxy)
-    return default_axes(request.proxy) if is_own else "x0"
+    is_turned = request.proxy.suffix.lower() == ".glb" and is_half_turned(request.proxy)
+    return default_axes(request.proxy) if is_turned else "x0"
 
 
 def _make_proxy(request: DeformRequest, rest: ImportedMesh, axes: Axes) -> "Proxy":
