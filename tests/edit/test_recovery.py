@@ -431,6 +431,15 @@ def test_recovery_keeps_min_opacity_deletions(make_scene: Make, exported, name: 
     assert len(result) == int((g.opacities >= 0.5).sum()) + report.carried
 
 
+def test_mesh_matched_by_order_has_lost_no_gaussians(make_scene: Make, exported) -> None:
+    g = make_scene(400)
+    # an OBJ that an editor saved has no comments
+    mesh = replace(exported(g, "scene.obj", min_opacity=0.5), q=None, min_opacity=None, scene_size=None)
+    result, report = recover(g, mesh, Path("scene.obj"))
+    assert report.deleted == 0 and report.carried == (g.opacities < 0.5).sum()
+    assert_same(result, g)
+
+
 def test_recovery_min_opacity_option_restores_faint_gaussians(make_scene: Make, exported) -> None:
     g = make_scene(200)
     mesh = replace(exported(g, min_opacity=0.7), min_opacity=None)
