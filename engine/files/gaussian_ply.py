@@ -49,6 +49,7 @@ from octasplat.engine.files.ply_dialects import (
     with_mip_filter,
 )
 from octasplat.engine.files.ply_positions import POSITION
+from octasplat.engine.files.range_losses import find_thickness_losses
 from octasplat.engine.files.registry import Exporter, Importer, register
 from octasplat.engine.files.splat_rows import select_for_export
 from octasplat.engine.gaussians.channels import Channels, column_names, stack_channels
@@ -396,5 +397,6 @@ register(
         holds_channels=True,
         holds_harmonics=True,
         holds_origin=True,
+        find_losses=functools.partial(find_thickness_losses, "gaussians"),
     )
 )
