@@ -3,9 +3,11 @@
 import errno
 import json
 import os
+import re
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from octasplat.engine.core.errors import DiskFullError
@@ -14,6 +16,9 @@ DISK_FULL_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 """Errors of the system that mean a full disk, a spent quota, or a limit on the size of files."""
 _MIN_FREE_BYTES = 16 << 20
 """Room for what a library writes at a time, as into a database."""
+_PARTIAL_NAME = re.compile(r"\.(.+)\.(\d+)\.partial(\.[^.]+)?")
+"""Stem, process and suffix of what :func:`atomic_replace` writes."""
+_SILENT_SECONDS = 60.0
 
 
 @contextmanager
@@ -61,6 +66,37 @@ def atomic_replace(path: Path) -> Iterator[Path]:
             temporary.replace(path)
         finally:
             temporary.unlink(missing_ok=True)
+
+
+def remove_abandoned(paths: Iterable[Path]) -> None:
+    """Remove the partial files of :func:`atomic_replace` that killed processes have left beside these files.
+
+    What may still be written stays: by a process that runs here or, as on a shared disk, by one that runs
+    elsewhere, whose file changed within the last minute.
+    """
+    names: dict[Path, set[str]] = {}
+    for path in paths:
+        names.setdefault(path.parent, set()).add(path.name)
+    for folder, wanted in names.items():
+        with suppress(OSError):
+            for left in list(folder.iterdir()):
+                match = _PARTIAL_NAME.fullmatch(left.name)
+                if match is None or match[1] + (match[3] or "") not in wanted or _is_running(int(match[2])):
+                    continue
+                with suppress(OSError):
+                    if time.time() - left.lstat().st_mtime > _SILENT_SECONDS:
+                        left.unlink()
+
+
+def _is_running(process: int) -> bool:
+    """Return whether there is a process of this number on this machine."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):
+        return True  # of somebody else, or no number of a process
+    return True
 
 
 def write_text(path: Path, text: str) -> None:

@@ -7,11 +7,13 @@ from jaxtyping import Float, Float64
 
 from octasplat.engine.files import ImportedMesh
 from octasplat.engine.files.octagon_glb_layout import OPAQUE_CUTOFF
-from octasplat.engine.gaussians.octagon import APOTHEM, CHI2_2_99, CHI2_3_99, cut_octagon_radii
+from octasplat.engine.gaussians.octagon import APOTHEM, CHI2_2_99, CHI2_3_99, SIDES, cut_octagon_radii
 
 Q_TOLERANCE = 1e-3
 MAX_SPREAD = 1e-3
 """Texture coordinates of octagons agree on their Q to this share of it, in an editor's 16 bits, too."""
+MAX_ORDER_SPREAD = 0.01
+"""Likewise of octagons without numbers, some nearly opaque, of which texture coordinates say little."""
 
 
 def exported_radii(
@@ -42,7 +44,7 @@ def infer_q(mesh: ImportedMesh, opacities: Float[np.ndarray, " n"], default: flo
     if mesh.q is not None and np.isfinite(mesh.q) and mesh.q > 0:
         return mesh.q
     if mesh.gid is None:
-        return default
+        return _q_by_order(mesh, opacities) or default
     vertices, logs = _known_opacities(mesh.gid, opacities)
     estimates = np.zeros(0)
     if mesh.radius is not None:
@@ -56,10 +58,32 @@ def infer_q(mesh: ImportedMesh, opacities: Float[np.ndarray, " n"], default: flo
     return _snap_q(float(np.median(estimates))) if len(estimates) else default
 
 
-def _snap_q(q: float) -> float:
+def _q_by_order(mesh: ImportedMesh, opacities: Float[np.ndarray, " n"]) -> float | None:
+    """Return the Q that texture coordinates say of octagons in the order of the scene; None if none.
+
+    Those of the most opaque Gaussians are there, as an export leaves out the faintest. Where their order has
+    changed, no Q fits most of them.
+    """
+    count, rest = divmod(len(mesh), SIDES)
+    if mesh.uv is None or rest or not 0 < count <= len(opacities):
+        return None
+    own = opacities[opacities >= np.sort(opacities)[len(opacities) - count]].astype(np.float64)
+    if len(own) != count:  # equally faint ones, only some of which are there
+        return None
+    squares = _squared_shares(mesh.uv).reshape(count, SIDES).mean(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        estimates = 2 * np.log(np.maximum(own, 1e-30)) / (squares - 1)
+    for nearest in (0.9, 0.999):  # nearer to 1 they say little, but may be all that there is
+        q, spread = _middle_and_spread(estimates[squares < nearest])
+        if q > 0 and spread < MAX_ORDER_SPREAD * q:
+            return _snap_q(q, max(Q_TOLERANCE, 3.0 * spread / q))
+    return None
+
+
+def _snap_q(q: float, tolerance: float = Q_TOLERANCE) -> float:
     """Return the nearest round value of Q, where rounding in the file left it a little off."""
     for chosen in (CHI2_2_99, CHI2_3_99, round(q, 2)):
-        if abs(q - chosen) <= Q_TOLERANCE * q:
+        if abs(q - chosen) <= tolerance * q:
             return chosen
     return q
 

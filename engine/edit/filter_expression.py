@@ -7,6 +7,7 @@ come from anybody.
 """
 
 import ast
+import math
 import operator
 from collections.abc import Callable, Mapping
 from functools import reduce
@@ -118,7 +119,8 @@ def _evaluate_condition(node: ast.expr, numbers: Mapping[str, np.ndarray]) -> np
     assert isinstance(node, ast.Compare)
     sides = [_evaluate_number(part, numbers) for part in (node.left, *node.comparators)]
     signs = [_COMPARISONS[type(sign)] for sign in node.ops]
-    steps = (sign(a, b) for sign, a, b in zip(signs, sides, sides[1:], strict=False))
+    with np.errstate(over="ignore"):  # of a number beyond those of the Gaussians, which is infinite for them
+        steps = [sign(a, b) for sign, a, b in zip(signs, sides, sides[1:], strict=False)]
     return np.asarray(reduce(np.logical_and, steps))
 
 
@@ -137,7 +139,10 @@ def _constant_value(node: ast.AST) -> float | None:
         and isinstance(node.value, int | float)
         and not isinstance(node.value, bool)
     ):
-        return float(node.value)
+        try:
+            return float(node.value)
+        except OverflowError:  # of a whole number; one with a point is infinite, too
+            return math.inf
     return None
 
 

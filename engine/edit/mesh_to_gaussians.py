@@ -78,6 +78,9 @@ def recover_gaussians(
     file_rounding = mesh.rounding
     requested, stated = options.min_opacity, mesh.min_opacity
     exported = (radii > 0) & (opacities >= ((stated or 0.0) if requested is None else requested))
+    if octagons.matched_by == "order":  # of which none is missing: what has no octagon was not exported
+        exported = np.zeros(len(gaussians), dtype=bool)
+        exported[octagons.gids] = True
     del mesh  # the largest thing around, where the caller keeps it no longer
     report = EditReport(len(gaussians), matched_by=octagons.matched_by, axes_usual=default_axes(path), q=q)
     if options.axes == "auto":

@@ -12,7 +12,11 @@ from octasplat.engine.files.encodings import SQRT_HALF, smallest_three
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.kd_split import kd_order
 from octasplat.engine.files.place_comments import place_comments
-from octasplat.engine.files.range_losses import find_harmonic_losses, find_position_losses
+from octasplat.engine.files.range_losses import (
+    find_harmonic_losses,
+    find_position_losses,
+    find_thickness_losses,
+)
 from octasplat.engine.files.registry import Exporter, register
 from octasplat.engine.files.splat_rows import select_for_export
 from octasplat.engine.gaussians.flattening import row_slices
@@ -102,6 +106,7 @@ def _find_losses(scene: FlatGaussians) -> tuple[str, ...]:
         steps[own] = of_chunks[np.arange(len(own)) // CHUNK_SIZE]
     del order
     return (
+        *find_thickness_losses("compressed-ply", scene),
         *find_position_losses("compressed-ply", scene, lambda rows: steps[rows]),
         *find_harmonic_losses("compressed-ply", scene, SH_RANGE / 2),
     )

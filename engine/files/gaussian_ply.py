@@ -23,6 +23,7 @@ from typing import Literal
 import numpy as np
 
 from octasplat.engine.core.errors import ConfigError, SceneFileError
+from octasplat.engine.core.local_origin import NO_ORIGIN, Origin
 from octasplat.engine.core.ply_container import (
     MAX_PROPERTIES,
     PlyElement,
@@ -32,12 +33,14 @@ from octasplat.engine.core.ply_container import (
     read_ply_header,
     write_ply,
 )
+from octasplat.engine.files import ply_positions
 from octasplat.engine.files.channel_columns import ChannelChoice, select_channel_columns
 from octasplat.engine.files.encodings import MAX_SH_DEGREE, dropped_sh_message
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.octagon_recovery import is_octagon_ply
 from octasplat.engine.files.place_comments import parse_place, place_comments
 from octasplat.engine.files.ply_dialects import (
+    FLAT_DIALECT_MESSAGE,
     MIP_FILTER,
     UNUSED_SCALE_MESSAGE,
     has_unused_third_scale,
@@ -45,6 +48,8 @@ from octasplat.engine.files.ply_dialects import (
     refuse_anchors,
     with_mip_filter,
 )
+from octasplat.engine.files.ply_positions import POSITION
+from octasplat.engine.files.range_losses import find_thickness_losses
 from octasplat.engine.files.registry import Exporter, Importer, register
 from octasplat.engine.files.splat_rows import select_for_export
 from octasplat.engine.gaussians.channels import Channels, column_names, stack_channels
@@ -69,7 +74,6 @@ is axis 2. ``games`` (GaMeS, REdiSplats): the last two lie in the plane, the nor
 """
 _NUMBERS = ("near_world", "pixel_rad", "turned_beyond")
 """Those of :class:`SceneMetadata` that a comment of the same name gives."""
-_POSITION = ("x", "y", "z")
 _NORMAL = ("nx", "ny", "nz")
 _SH_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _CHANNEL = "octasplat_channel"
@@ -104,7 +108,7 @@ def write_gaussian_ply(
     if sh_pad_degree is not None and not 0 <= sh_pad_degree <= MAX_SH_DEGREE:
         raise SceneFileError(f"{path}: not written, as sh_pad_degree is {sh_pad_degree} but must be 0 to 3.")
     degree = max(gaussians.sh_degree, sh_pad_degree or 0)
-    names = [*_POSITION, *_NORMAL, *_SH_DC, *_rest_names(degree), "opacity", *_scale_names(3), *_ROTATION]
+    names = [*POSITION, *_NORMAL, *_SH_DC, *_rest_names(degree), "opacity", *_scale_names(3), *_ROTATION]
     widths = gaussians.channels.widths
     names += [column for name, width in widths.items() for column in column_names(name, width)]
     dtype = np.dtype([(name, "<f4") for name in names])
@@ -119,7 +123,8 @@ def read_ply_metadata(path: Path) -> SceneMetadata:
         SceneFileError: the file is damaged, or says something that is no number.
     """
     # Reversed, so that the first comment of a name counts
-    metadata = dict(comment.partition(" ")[::2] for comment in reversed(read_ply_header(path).comments))
+    header = read_ply_header(path)
+    metadata = dict(comment.partition(" ")[::2] for comment in reversed(header.comments))
     known: dict[str, float] = {}
     for name in _NUMBERS:
         if (value := metadata.get(name)) is None:
@@ -131,6 +136,8 @@ def read_ply_metadata(path: Path) -> SceneMetadata:
         if not math.isfinite(known[name]):  # max() passes on what is not a number
             raise SceneFileError(f"{path}: its comment {name} is {value!r}, which is no number.")
     origin, georeference = parse_place(path, metadata)
+    if ply_positions.asks_for_origin(header):
+        origin = ply_positions.origin_of_positions(read_ply(path, ["vertex"])[1]["vertex"])
     facts = SceneMetadata(**known, origin_world=origin, georeference=georeference)
     return replace(facts, turned_beyond=min(facts.turned_beyond, 1.0))  # it is a cosine
 
@@ -138,7 +145,7 @@ def read_ply_metadata(path: Path) -> SceneMetadata:
 def metadata_comments(facts: SceneMetadata) -> list[str]:
     """Return the comments of a PLY that say what is known of its scene as a whole."""
     known = [(name, getattr(facts, name)) for name in _NUMBERS]
-    numbers = [f"{name} {value!r}" for name, value in known if value > 0]
+    numbers = [f"{name} {float(value)!r}" for name, value in known if value > 0]
     return [*numbers, *place_comments(facts.origin_world, facts.georeference)]
 
 
@@ -230,8 +237,9 @@ def read_ply_blocks(path: Path, channels: ChannelChoice = "own", dialect: PlyDia
     table = read_ply(path, ["vertex"])[1]["vertex"]
     unnamed = [name for name in vertex.names if name != MIP_FILTER]
     named = select_channel_columns(path, declared_channels(header.comments), unnamed, channels)
+    origin = ply_positions.origin_of_positions(table) if ply_positions.asks_for_origin(header) else NO_ORIGIN
     normal_axis, notes = _normal_axis(dialect, scale_count), dropped_sh_message(degree)
-    used = {*_POSITION, *_NORMAL, *_ROTATION, *_SH_DC, "opacity", MIP_FILTER, *_scale_names(scale_count)}
+    used = {*POSITION, *_NORMAL, *_ROTATION, *_SH_DC, "opacity", MIP_FILTER, *_scale_names(scale_count)}
     used |= {*_POINT_COLORS, *(column for own in named.values() for column in own)}
     ignored = [name for name in vertex.names if name not in used and not name.startswith("f_rest_")]
     if ignored:
@@ -239,10 +247,10 @@ def read_ply_blocks(path: Path, channels: ChannelChoice = "own", dialect: PlyDia
     if dialect == "3dgs" and scale_count == 3 and has_unused_third_scale(table, _scale_names(3)):
         normal_axis, notes = 2, (*notes, UNUSED_SCALE_MESSAGE)
     if dialect == "3dgs" and scale_count == 2:
-        notes = (*notes, _FLAT_DIALECT_MESSAGE)
+        notes = (*notes, FLAT_DIALECT_MESSAGE)
 
     def block(rows: slice) -> GaussianCloud:
-        cloud = _read_rows(path, table[rows], degree, scale_count, named)
+        cloud = _read_rows(path, table[rows], degree, scale_count, named, origin)
         cloud = replace(cloud, notes=notes, normal_axis=normal_axis)
         filtered = MIP_FILTER in vertex.names
         return with_mip_filter(cloud, columns(table[rows], [MIP_FILTER])[:, 0]) if filtered else cloud
@@ -251,9 +259,14 @@ def read_ply_blocks(path: Path, channels: ChannelChoice = "own", dialect: PlyDia
 
 
 def _read_rows(
-    path: Path, table: np.ndarray, degree: int, scale_count: int, named: Mapping[str, tuple[str, ...]]
+    path: Path,
+    table: np.ndarray,
+    degree: int,
+    scale_count: int,
+    named: Mapping[str, tuple[str, ...]],
+    origin: Origin,
 ) -> GaussianCloud:
-    """Return the Gaussians of some rows, with channels of these columns."""
+    """Return the Gaussians of some rows about a local origin, with channels of these columns."""
     retained = (min(degree, MAX_SH_DEGREE) + 1) ** 2 - 1
     each = (degree + 1) ** 2 - 1
     names = [f"f_rest_{color * each + k}" for color in range(3) for k in range(retained)]
@@ -264,19 +277,13 @@ def _read_rows(
     except ConfigError as error:
         raise SceneFileError(f"{path}: {error}") from error
     return GaussianCloud(
-        means_world=columns(table, _POSITION),
+        means_world=ply_positions.positions_about(table, origin),
         quats_wxyz=columns(table, _ROTATION),
         log_scales=columns(table, _scale_names(scale_count)),
         opacity_logits=columns(table, ["opacity"])[:, 0],
         sh=np.ascontiguousarray(np.concatenate([colors[:, None, :3], rest], axis=1)),
         channels=found,
     )
-
-
-_FLAT_DIALECT_MESSAGE = (
-    "Its Gaussians have two scales; they were read as 2DGS writes them, with the third axis as the normal. "
-    "If GaMeS or REdiSplats wrote the file, import it with --format games."
-)
 
 
 def _normal_axis(dialect: PlyDialect, scale_count: int) -> Literal[0, 2] | None:
@@ -316,7 +323,7 @@ def _check_properties(path: Path, vertex: PlyElement) -> tuple[int, int]:
     names = set(vertex.names)
     rest_count = sum(name.startswith("f_rest_") for name in names)
     scale_count = 3 if "scale_2" in names else 2
-    needed = [*_POSITION, *_SH_DC, "opacity", *_scale_names(scale_count), *_ROTATION]
+    needed = [*POSITION, *_SH_DC, "opacity", *_scale_names(scale_count), *_ROTATION]
     missing = [name for name in needed if name not in names]
     # Before the missing properties are told, as this says more
     refuse_anchors(path, names)
@@ -390,5 +397,6 @@ register(
         holds_channels=True,
         holds_harmonics=True,
         holds_origin=True,
+        find_losses=functools.partial(find_thickness_losses, "gaussians"),
     )
 )

@@ -6,7 +6,7 @@ vertex attributes that they do not know or stop at the raw bytes.
 
 import json
 import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -47,7 +47,7 @@ MAX_PRIMITIVES = 100_000
 MAX_CHANNEL_COLUMNS = 10_000
 CHANNELS = "octasplat_channels"
 ALL_ROWS = slice(None)
-GLB_READ_ERRORS = (KeyError, IndexError, TypeError, ValueError, AttributeError)
+GLB_READ_ERRORS = (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError)
 """What reading a document that says nonsense may raise."""
 
 
@@ -240,6 +240,22 @@ def read_glb_metadata(path: Path) -> SceneMetadata:
         raise SceneFileError(f"{path}: its glTF is damaged or not understood ({error}).") from error
 
 
+def is_half_turned(path: Path) -> bool:
+    """Return whether octasplat wrote the meshes of a GLB, and no other program since, y up by a half turn.
+
+    What is lit is turned as its light asks.
+
+    Raises:
+        SceneFileError: the file is no GLB, or is damaged.
+    """
+    match GlbFile(path).document:
+        case {"asset": {"generator": "octasplat"}, "nodes": [{"rotation": list() as rotation, **root}, *_]}:
+            extras = root.get("extras")
+            is_upright = isinstance(extras, Mapping) and TURN_KEY in extras
+            return is_upright or rotation == HALF_TURN_ABOUT_X
+    return False
+
+
 def _node_matrix(node: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T  # glTF stores columns
@@ -326,16 +342,26 @@ def channel_extras(widths: Mapping[str, int]) -> dict[str, object]:
     return {CHANNELS: dict(widths)} if widths else {}
 
 
-def declared_channel_attributes(document: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
-    """Return the channels that a file's ``extras`` name, with their attributes in lower case without _."""
+def declared_channel_attributes(
+    document: Mapping[str, Any], columns: Collection[str]
+) -> dict[str, tuple[str, ...]]:
+    """Return the channels that a file's ``extras`` name, with their attributes in lower case without _.
+
+    Args:
+        document: JSON of the file.
+        columns: attributes of a primitive, likewise. A channel is one vector there, as of splats, or a scalar
+            for each of its numbers, as of octagons.
+    """
     found = asset_extras(document).get(CHANNELS, {})
     widths = {name: int(width) for name, width in found.items() if width > 0}
     if sum(widths.values()) > MAX_CHANNEL_COLUMNS:
         raise ValueError(f"its channels have more than {MAX_CHANNEL_COLUMNS} columns")
-    columns: dict[str, list[str]] = {}
-    for attribute in channel_attributes(widths):
-        columns.setdefault(attribute.channel, []).append(attribute.semantic[1:].lower())
-    return {name: tuple(own) for name, own in columns.items()}
+    return {
+        name: (name.lower(),)
+        if name.lower() in columns
+        else tuple(column.lower() for column in column_names(name, width))
+        for name, width in widths.items()
+    }
 
 
 def json_bytes(document: dict[str, object]) -> bytes:

@@ -6,6 +6,7 @@ readers that evaluate harmonics in world directions are right too. With untransf
 only, so that our own files keep the bits of positions and harmonics.
 """
 
+import functools
 import itertools
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ from octasplat.engine.files.encodings import (
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.glb_container import FLOAT, UNSIGNED_BYTE, pad_to_four, write_glb
 from octasplat.engine.files.glb_place import root_place
+from octasplat.engine.files.range_losses import find_thickness_losses
 from octasplat.engine.files.registry import Exporter, register
 from octasplat.engine.files.splat_rows import check_scales, iterate_blocks, select_for_export
 from octasplat.engine.gaussians.model import FLAT_SCALE, FlatGaussians
@@ -198,5 +200,6 @@ register(
         holds_channels=True,
         holds_harmonics=True,
         holds_origin=True,
+        find_losses=functools.partial(find_thickness_losses, "khr-glb"),
     )
 )

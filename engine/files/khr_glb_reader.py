@@ -56,13 +56,13 @@ def _read_blocks(path: Path, channels: ChannelChoice = "own") -> CloudBlocks:
     file = GlbFile(path)
     parts: list[_Splats] = []
     with _name_errors(path):
-        declared = glb_container.declared_channel_attributes(file.document)
         for matrix, primitive in file.primitives():
             splats = primitive.get("extensions", {}).get(EXTENSION)
             if splats is None:
                 continue
             attributes = primitive["attributes"]
             columns = {name[1:].lower(): number for name, number in attributes.items() if name[0] == "_"}
+            declared = glb_container.declared_channel_attributes(file.document, columns)
             requested = select_channel_columns(path, declared, columns, channels)
             named = {name: tuple(columns[column] for column in own) for name, own in requested.items()}
             parts.append(_Splats(path, file, attributes, splats, file.about_origin(matrix), named))

@@ -105,7 +105,7 @@ def read_with_materials(path: Path) -> ImportedMesh:
         SceneFileError: likewise.
     """
     mesh = read(path)
-    if mesh.triangles.max(initial=-1) >= len(mesh):
+    if mesh.triangles.max(initial=-1) >= len(mesh) or mesh.triangles.min(initial=0) < 0:
         return mesh  # damaged, which is told for all formats alike
     header, tables = read_ply(path, ["vertex"])
     table, vertex = tables["vertex"], header.element("vertex")

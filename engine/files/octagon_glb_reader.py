@@ -91,7 +91,7 @@ class _Octagons:
         # From glTF's y up to our y down
         self._turned = np.diag([1.0, -1.0, -1.0, 1.0]) @ file.about_origin(matrix)
         columns = {name[1:].lower(): number for name, number in self._attributes.items() if name[0] == "_"}
-        declared = glb_container.declared_channel_attributes(file.document)
+        declared = glb_container.declared_channel_attributes(file.document, columns)
         requested = select_channel_columns(path, declared, columns, channels)
         self._channels = {name: [columns[column] for column in own] for name, own in requested.items()}
         self.channel_names = tuple(self._channels)

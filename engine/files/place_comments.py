@@ -14,7 +14,7 @@ ORIGIN_KEY = "origin_world"
 
 def place_comments(origin: Origin, georeference: Georeference | None) -> list[str]:
     """Return the comments of a text or a PLY that say where it has its origin, if that is not 0, and lies."""
-    own = [f"{ORIGIN_KEY} {' '.join(map(repr, origin))}"] if is_set(origin) else []
+    own = [f"{ORIGIN_KEY} {' '.join(repr(float(value)) for value in origin)}"] if is_set(origin) else []
     return own + georeference_comments(georeference)
 
 

@@ -16,6 +16,10 @@ MIP_FILTER = "filter_3D"
 """Standard deviation (world units) of the smoothing that Mip-Splatting and Gaussian Opacity Fields apply to
 each Gaussian before they show it."""
 _MAX_NAMES = 8
+FLAT_DIALECT_MESSAGE = (
+    "Its Gaussians have two scales; they were read as 2DGS writes them, with the third axis as the normal. "
+    "If GaMeS or REdiSplats wrote the file, import it with --format games."
+)
 UNUSED_SCALE_MESSAGE = (
     "Its third scales were never trained, as those of gsplat's 2DGS; it was read so, with the third axis as "
     "the normal."

@@ -11,10 +11,14 @@ from jaxtyping import Float
 
 from octasplat.engine.files.splat_rows import iterate_blocks
 from octasplat.engine.gaussians.flattening import row_slices
-from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.model import FLAT_SCALE, FlatGaussians
 
 MIN_REPORTED_FRACTION = 1e-3
 """Losses of fewer Gaussians than this fraction are not told; those that are too large always are."""
+MAX_THICKNESS, WANTED_THICKNESS = 0.25, 0.01
+"""Of the larger standard deviation: from which on a thickness shows, and what hides it."""
+MIN_SMALL_FRACTION = 0.1
+"""Where fewer Gaussians are as small as that, the scene is not."""
 
 
 def find_size_losses(
@@ -47,6 +51,30 @@ def find_size_losses(
         f"The format {format_name} holds sizes from {math.exp(min_log_scale):.2g} to "
         f"{math.exp(max_log_scale):.3g} units; {large + small:,} of {len(scene):,} Gaussians do not fit and "
         f"will be clipped{advice}.",
+    )
+
+
+def find_thickness_losses(format_name: str, scene: FlatGaussians) -> tuple[str, ...]:
+    """Return what becomes of a scene in units so large that the thickness of flat Gaussians shows.
+
+    Other programs show them as thick as the file has them.
+
+    Args:
+        format_name: of the format.
+        scene: what is written.
+    """
+    if len(scene) == 0:
+        return ()
+    sizes = np.concatenate([block.log_scales.max(axis=1) for block in iterate_blocks(scene)])
+    small = int((sizes < math.log(FLAT_SCALE / MAX_THICKNESS)).sum())
+    if small < MIN_SMALL_FRACTION * len(scene):
+        return ()
+    needed = math.log(FLAT_SCALE / WANTED_THICKNESS) - float(np.median(sizes))
+    power = max(math.ceil(needed / math.log(10)), 1)
+    return (
+        f"The format {format_name} has Gaussians {FLAT_SCALE:g} units thick, which is much for the size of "
+        f"{small:,} of {len(scene):,} here: programs that show Gaussians with a thickness blur them; "
+        f"octasplat transform --scale {10.0**power:.3g} makes it little.",
     )
 
 

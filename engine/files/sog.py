@@ -24,7 +24,7 @@ from octasplat.engine.files.channel_columns import ChannelChoice
 from octasplat.engine.files.encodings import SQRT_HALF, from_smallest_three, logits_from_bytes
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
-from octasplat.engine.files.range_losses import find_position_losses
+from octasplat.engine.files.range_losses import find_position_losses, find_thickness_losses
 from octasplat.engine.files.registry import Exporter, Importer, register
 from octasplat.engine.files.splat_rows import select_for_export
 from octasplat.engine.files.splat_transform import convert, missing_converter
@@ -308,7 +308,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
 
 
 def find_sog_losses(scene: FlatGaussians) -> tuple[str, ...]:
-    """Return what positions of 16 bits lose of a scene, in sentences."""
+    """Return what positions of 16 bits, and the thickness, lose of a scene, in sentences."""
     if len(scene) == 0 or not scene.is_finite():
         return ()  # which is refused
     ends = np.stack([scene.means_world.min(axis=0), scene.means_world.max(axis=0)]).astype(np.float64)
@@ -319,7 +319,7 @@ def find_sog_losses(scene: FlatGaussians) -> tuple[str, ...]:
         steps = (1.0 + np.abs(scene.means_world[rows].astype(np.float64))) * step
         return np.asarray(steps.max(axis=1))
 
-    return find_position_losses("sog", scene, steps_world)
+    return (*find_thickness_losses("sog", scene), *find_position_losses("sog", scene, steps_world))
 
 
 def _recognises(head: bytes) -> bool:

@@ -1,5 +1,6 @@
 """.splat: 32 bytes a Gaussian without a header; color and opacity are bytes, harmonics are missing."""
 
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from octasplat.engine.core.writing import atomic_replace
 from octasplat.engine.files.channel_columns import ChannelChoice
 from octasplat.engine.files.encodings import logits_from_bytes, sh0_from_rgb, unit_quats
 from octasplat.engine.files.export_options import ExportOptions
+from octasplat.engine.files.range_losses import find_thickness_losses
 from octasplat.engine.files.registry import Exporter, Importer, register
 from octasplat.engine.files.splat_rows import check_scales, iterate_blocks, select_for_export
 from octasplat.engine.gaussians.flattening import CloudBlocks, GaussianCloud, join_blocks, row_slices
@@ -85,4 +87,12 @@ def _splat_rows(some: FlatGaussians) -> np.ndarray:
 register(
     Importer("splat", ("*.splat",), "32 bytes a Gaussian (antimatter15)", read, read_blocks=_read_blocks)
 )
-register(Exporter("splat", ("*.splat",), "32 bytes a Gaussian for web viewers (antimatter15)", write))
+register(
+    Exporter(
+        "splat",
+        ("*.splat",),
+        "32 bytes a Gaussian for web viewers (antimatter15)",
+        write,
+        find_losses=functools.partial(find_thickness_losses, "splat"),
+    )
+)

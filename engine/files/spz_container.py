@@ -30,7 +30,8 @@ from octasplat.engine.files.spz_records import (
 )
 
 MAGIC = b"NGSP"
-GZIP_MAGIC = b"\x1f\x8b"
+GZIP_MAGIC = b"\x1f\x8b\x08"
+"""With the byte for Deflate, as a number that something else begins with may have the first two."""
 VERSIONS = (2, 3, 4)
 MAX_DEGREE = 4
 GZIP_LEVEL, ZSTD_LEVEL = 6, 9

@@ -18,7 +18,8 @@ FILL_VALUE = 0.0
 """What Gaussians have that come to a scene from one without the channel."""
 RESERVED_COLUMNS = re.compile(
     r"x|y|z|n[xyz]|s|t|red|green|blue|alpha|opacity|(f_dc|f_rest|scale|rot)(_\d+)?|packed_.*"
-    r"|gid|corner|radius|displaycolor|displayopacity",
+    r"|gid|corner|radius|displaycolor|displayopacity"
+    r"|filter_3d|f_rest_.*|f_offset.*|f_anchor_feat.*",
     re.IGNORECASE,
 )
 """Columns that mean something else in some format."""

@@ -14,9 +14,10 @@ from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.core.events import EventListener, ignore_events
 from octasplat.engine.core.local_origin import Origin
 from octasplat.engine.core.threads import use_threads
-from octasplat.engine.edit.axes import AXIS_ROTATIONS, Axes
+from octasplat.engine.edit.axes import AXIS_ROTATIONS, Axes, default_axes
 from octasplat.engine.edit.reports import DeformReport
 from octasplat.engine.files import ImportedMesh, read_mesh, read_metadata
+from octasplat.engine.files.glb_container import is_half_turned
 from octasplat.engine.operations.base import (
     Operation,
     Options,
@@ -60,10 +61,11 @@ class DeformOptions(Options):
         description="Follow fully up to this distance from the mesh, and not at all beyond twice of it; inf "
         "for everything.  [default: nearest: a tenth of the mesh's diagonal; mvc: inside of the cage]",
     )
-    axes: Axes = Field(
-        "x0",
-        description="Turn of both meshes about x, in degrees, that brings them to the scene's axes; x90 for "
-        "what Blender saves as OBJ or GLB beside a scene imported as PLY.",
+    axes: Literal["auto"] | Axes = Field(
+        "auto",
+        description="Turn of both meshes about x, in degrees, that brings them to the scene's axes: auto is "
+        "x180 where octasplat wrote the proxy as GLB, which is y up, else x0; x90 is for what Blender saves "
+        "as OBJ or GLB beside a scene imported as PLY.",
     )
     mirrored: Literal["auto", "yes", "no"] = Field(
         "auto",
@@ -112,14 +114,19 @@ def run(
     frames = SceneSequence("deform", request, paths, [request.proxy])
     gaussians, origin = open_scene(source, progress), read_metadata(source).origin_world
     rest = read_mesh(request.proxy).about(origin)
+    axes = _axes_of_meshes(request)
     # Gaussians follow the corners of their octagons
     corners = deformation_corners(gaussians)
-    binding = _bind_scene(request, _make_proxy(request, rest), corners)
+    binding = _bind_scene(request, _make_proxy(request, rest, axes), corners)
     moving, count = int(binding.moving_mask.sum()), len(gaussians)
     note = describe_edit("deform", options_of(DeformOptions, request))
     reports, notes = [], [f"{request.proxy}: moves {moving:,} of {count:,} Gaussians."]
+    if axes != "x0" and request.axes == "auto":
+        notes.append(
+            f"  meshes turned by {axes}, as octasplat wrote that one along the axes of glTF (--axes)"
+        )
     for number, path in enumerate(paths):
-        vertices = _rotate_mesh(_check_same_mesh(path, request.proxy, rest, origin), request.axes)
+        vertices = _rotate_mesh(_check_same_mesh(path, request.proxy, rest, origin), axes)
         result, report = deform_to(
             gaussians, corners, binding.deform(vertices), binding.mirrored_mask(vertices)
         )
@@ -138,12 +145,20 @@ def run(
     )
 
 
-def _make_proxy(request: DeformRequest, rest: ImportedMesh) -> "Proxy":
+def _axes_of_meshes(request: DeformRequest) -> Axes:
+    """Return the turn of the meshes; where nobody says it, that of a GLB of ours, or none."""
+    if request.axes != "auto":
+        return request.axes
+    is_turned = request.proxy.suffix.lower() == ".glb" and is_half_turned(request.proxy)
+    return default_axes(request.proxy) if is_turned else "x0"
+
+
+def _make_proxy(request: DeformRequest, rest: ImportedMesh, axes: Axes) -> "Proxy":
     from octasplat.engine.edit.proxy import Proxy
 
     mirrored = {"auto": None, "yes": True, "no": False}[request.mirrored]  # None: the deformed mesh shows it
     try:
-        return Proxy(_rotate_mesh(rest, request.axes), rest.triangles, mirrored)
+        return Proxy(_rotate_mesh(rest, axes), rest.triangles, mirrored)
     except SceneFileError as error:
         raise SceneFileError(f"{request.proxy}: {error}") from None
 

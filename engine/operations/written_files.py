@@ -20,6 +20,7 @@ import platformdirs
 from octasplat.engine.core.errors import ConfigError, OutputError
 from octasplat.engine.core.portable_names import is_text
 from octasplat.engine.core.scene_layout import SCENE_FOLDERS
+from octasplat.engine.core.writing import remove_abandoned
 from octasplat.engine.dataset.results_among import is_run_folder
 
 RECORD_VARIABLE = "OCTASPLAT_WRITTEN"
@@ -47,7 +48,7 @@ _RUN_FOLDERS = ("cache", "checkpoints", "poses")
 def check_targets(
     verb: str, targets: Iterable[Path], inputs: Sequence[Path | None], *, overwrite: bool = False
 ) -> None:
-    """Check before long work that files may be written.
+    """Check before long work that files may be written; what killed processes have left of them is removed.
 
     Args:
         verb: what writes them.
@@ -72,8 +73,13 @@ def check_targets(
                 f"{target}: would overwrite what the command reads{folder}; choose another name."
             )
     there = [target for target in checked if target.exists()]
-    if overwrite or not there:
-        return
+    if there and not overwrite:
+        _refuse_foreign(verb, there)
+    remove_abandoned(checked)
+
+
+def _refuse_foreign(verb: str, there: Sequence[Path]) -> None:
+    """Raise OutputError if one of the files that are there is somebody else's."""
     known = _recorded_files(verb, there)
     if foreign := [target for target in there if not _is_ours(target, known)]:
         more = f" and {len(foreign) - 1:,} more are" if len(foreign) > 1 else " is"

@@ -1445,7 +1445,7 @@ def deform(
     report: PathLike | None = None,
     method: Literal["nearest", "mvc"] | None = None,
     reach: float | None = None,
-    axes: Literal["x0", "x90", "x180", "x270"] | None = None,
+    axes: Literal["auto"] | Literal["x0", "x90", "x180", "x270"] | None = None,
     mirrored: Literal["auto", "yes", "no"] | None = None,
     progress: EventListener | None = None,
     should_stop: Callable[[], bool] = never_stop,
@@ -1468,8 +1468,9 @@ def deform(
             Default: nearest.
         reach: Follow fully up to this distance from the mesh, and not at all beyond twice of it; inf
             for everything. [default: nearest: a tenth of the mesh's diagonal; mvc: inside of the cage]
-        axes: Turn of both meshes about x, in degrees, that brings them to the scene's axes; x90 for
-            what Blender saves as OBJ or GLB beside a scene imported as PLY. Default: x0.
+        axes: Turn of both meshes about x, in degrees, that brings them to the scene's axes: auto is
+            x180 where octasplat wrote the proxy as GLB, which is y up, else x0; x90 is for what Blender
+            saves as OBJ or GLB beside a scene imported as PLY. Default: auto.
         mirrored: Whether the deformed mesh was mirrored; auto looks at it, which a flat mesh cannot
             show. Default: auto.
         progress: told each event; by default they are logged, or shown in a notebook.

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.files import export_scene, read_mesh, read_metadata
+from octasplat.engine.files import export_scene, read_mesh, read_metadata, write_surface
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from octasplat.engine.gaussians.affine import transform_gaussians
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.scene_metadata import SceneMetadata
+from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 from tests.support.edit_scenes import assert_same, cube
 
 Make = Callable[..., FlatGaussians]
@@ -154,6 +155,32 @@ def test_deform_command_follows_mesh(octasplat, scene: Path, tmp_path: Path, met
     for number in (0, 1):
         moved = read(tmp_path / f"out_000{number}.ply").means_world
         np.testing.assert_allclose(moved, read(scene).means_world + np.float32([0, 0, number + 1]), atol=1e-6)
+
+
+def test_deform_by_a_surface_of_ours_follows_its_axes(octasplat, scene: Path, tmp_path: Path) -> None:
+    vertices, triangles = cube(2, 4.0)
+    shift = np.array([0.0, 1.0, 0.5])
+    for name, points in (("rest", vertices), ("bent", vertices + shift)):
+        mesh = TriangleMesh(points.astype(np.float32), triangles.astype(np.int32))
+        write_surface(mesh, tmp_path / f"{name}.glb")  # y up, as glTF has it
+    out = tmp_path / "out.ply"
+    command = (
+        "deform",
+        scene,
+        "--proxy",
+        tmp_path / "rest.glb",
+        "--deformed",
+        tmp_path / "bent.glb",
+        "-o",
+        out,
+    )
+    result = octasplat(*command, "--method", "mvc")
+    assert result.exit_code == 0, result.output
+    assert "turned by x180" in result.stdout
+    np.testing.assert_allclose(read(out).means_world, read(scene).means_world + shift, atol=1e-6)
+    result = octasplat(*command, "--method", "mvc", "--axes", "x0")
+    assert result.exit_code == 0 and "turned by" not in result.stdout
+    np.testing.assert_allclose(read(out).means_world, read(scene).means_world - shift, atol=1e-6)
 
 
 def test_deform_refuses_other_meshes_and_proxies_far_away(octasplat, scene: Path, tmp_path: Path) -> None:

@@ -30,6 +30,7 @@ def scene(make_scene):
         ),
         ("label_1 != y", lambda g: g.channels["label"][:, 1] != g.means_world[:, 1]),
         ("1 < 2", lambda g: np.ones(60, bool)),
+        (f"x < 1{400 * '0'} and x > -1e400 and z < 1e39", lambda g: np.ones(60, bool)),
     ],
 )
 def test_filter_expression_comparisons_select_expected(scene, text, wanted):

@@ -12,7 +12,7 @@ from octasplat.engine.edit.edit_options import MeshToGaussiansOptions
 from octasplat.engine.edit.mesh_to_gaussians import EditReport, recover_gaussians
 from octasplat.engine.files import ExportOptions, ImportedMesh, export_scene, read_mesh
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.gaussians.octagon import SIDES
+from octasplat.engine.gaussians.octagon import CHI2_3_99, SIDES
 from octasplat.engine.gaussians.spherical_harmonics import sh_basis
 from tests.support.edit_scenes import (
     assert_same,
@@ -88,8 +88,6 @@ def test_export_options_are_found_out(make_scene: Make, exported, name: str, opt
     g = make_scene(200)
     mesh = exported(g, name, **options)
     for known in (mesh, replace(mesh, q=None, alpha_cutoff=None)):
-        if name.endswith("obj") and known.q is None and "q" in options:
-            continue  # an OBJ has no ids by which its textures could be compared
         result, report = recover(g, known, Path(name))
         assert_same(result, g)
         assert report.deleted == 0
@@ -100,6 +98,21 @@ def test_recovery_infers_q_from_texture(make_scene: Make, exported) -> None:
     g = make_scene(200)
     mesh = replace(exported(g, "scene.glb", q=5.0), q=None, radius=None)
     assert recover(g, mesh, Path("scene.glb"))[1].q == pytest.approx(5.0)
+
+
+@pytest.mark.parametrize("is_opaque", [False, True])
+@pytest.mark.parametrize("q", [CHI2_3_99, 16.0])
+def test_q_of_a_mesh_without_ids_follows_from_its_texture(
+    make_scene: Make, exported, is_opaque: bool, q: float
+) -> None:
+    g = make_scene(400)
+    if is_opaque:
+        g.opacity_logits[:] = np.random.default_rng(0).uniform(3.0, 6.0, 400)
+    # an OBJ that an editor saved has no comments
+    mesh = replace(exported(g, "scene.obj", q=q), q=None, min_opacity=None, scene_size=None)
+    result, report = recover(g, mesh, Path("scene.obj"))
+    assert report.q == q and report.moved == 0
+    assert_same(result, g)
 
 
 def test_recovery_changes_moved_octagons_only(make_scene: Make, exported) -> None:
@@ -416,6 +429,15 @@ def test_recovery_keeps_min_opacity_deletions(make_scene: Make, exported, name: 
     never = int((g.opacities < least).sum())
     assert report.carried + report.orphaned == never
     assert len(result) == int((g.opacities >= 0.5).sum()) + report.carried
+
+
+def test_mesh_matched_by_order_has_lost_no_gaussians(make_scene: Make, exported) -> None:
+    g = make_scene(400)
+    # an OBJ that an editor saved has no comments
+    mesh = replace(exported(g, "scene.obj", min_opacity=0.5), q=None, min_opacity=None, scene_size=None)
+    result, report = recover(g, mesh, Path("scene.obj"))
+    assert report.deleted == 0 and report.carried == (g.opacities < 0.5).sum()
+    assert_same(result, g)
 
 
 def test_recovery_min_opacity_option_restores_faint_gaussians(make_scene: Make, exported) -> None:

@@ -249,6 +249,37 @@ def test_value_beyond_float32_is_nonfinite(make_gaussians: Make, tmp_path: Path)
         read_gaussian_ply(write_columns(tmp_path / "a.ply", columns))
 
 
+@pytest.mark.parametrize("layout", ["binary_little_endian", "binary_big_endian", "ascii"])
+def test_map_coordinates_in_64_bits_keep_their_digits(
+    make_gaussians: Make, tmp_path: Path, layout: str
+) -> None:
+    g = make_gaussians(70)
+    placed = g.means_world.astype(np.float64) + np.array([691632.1, 5334761.4, 520.3])
+    columns = columns_of(g) | dict(zip("xyz", placed.T, strict=True))
+    path = write_columns(tmp_path / "a.ply", columns, layout)
+    back, facts = read_scene(path)[0], read_metadata(path)
+    # half a metre in 32 bits
+    np.testing.assert_allclose(back.means_world + np.array(facts.origin_world), placed, rtol=0, atol=1e-6)
+    write_gaussian_ply(back, tmp_path / "b.ply", facts=facts)
+    assert read_metadata(tmp_path / "b.ply") == facts
+    assert_same_bits(read_gaussian_ply(tmp_path / "b.ply")[0], back)
+
+
+def test_64_bits_near_the_origin_are_read_as_they_are(make_gaussians: Make, tmp_path: Path) -> None:
+    g = make_gaussians(70)
+    columns = {name: column.astype(np.float64) for name, column in columns_of(g).items()}
+    path = write_columns(tmp_path / "a.ply", columns)
+    assert read_metadata(path) == SceneMetadata()
+    assert_same_bits(read_gaussian_ply(path)[0], g)
+
+
+def test_gaussian_ply_metadata_may_be_numbers_of_numpy(make_gaussians: Make, tmp_path: Path) -> None:
+    x, y, z = np.array([512350.0, 5403210.0, 310.0])
+    facts = SceneMetadata(near_world=np.float64(0.25), origin_world=(x, y, z))
+    write_gaussian_ply(make_gaussians(2), tmp_path / "a.ply", facts=facts)
+    assert read_metadata(tmp_path / "a.ply") == facts
+
+
 def test_undefined_opacities_and_rotations_are_refused(make_gaussians: Make, tmp_path: Path) -> None:
     g = make_gaussians(5)
     g.opacity_logits[3] = np.nan

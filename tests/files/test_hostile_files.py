@@ -2,6 +2,7 @@
 
 import gc
 import json
+import math
 import struct
 import time
 from collections.abc import Callable
@@ -65,6 +66,17 @@ def overlapping_rows(path: Path) -> Path:
     accessors = [{"bufferView": 0, "componentType": 5126, "count": 1 << 40, "type": "VEC3"}]
     views = [{"buffer": 0, "byteLength": 12, "byteStride": 0}]
     return glb(path, accessors=accessors, bufferViews=views)
+
+
+def endless_count(path: Path) -> Path:
+    """A count of rows beyond the numbers of 64 bits."""
+    accessors = [{"bufferView": 0, "componentType": 5126, "count": math.inf, "type": "VEC3"}]
+    return glb(path, accessors=accessors)
+
+
+def endless_offset(path: Path) -> Path:
+    """Data that begin beyond the numbers of 64 bits."""
+    return glb(path, bufferViews=[{"buffer": 0, "byteLength": 12, "byteOffset": 10**30}])
 
 
 def deep_json(path: Path) -> Path:
@@ -131,7 +143,7 @@ READERS: dict[str, Callable[[Path], object]] = {
 }
 ATTACKS: list[tuple[Callable[[Path], Path], str, str]] = [
     *((make, "a.glb", "mesh") for make in (doubling, sharing, many_primitives, overlapping_rows)),
-    *((make, "a.glb", "mesh") for make in (deep_json, empty_chunks)),
+    *((make, "a.glb", "mesh") for make in (deep_json, empty_chunks, endless_count, endless_offset)),
     *((make, "a.glb", "scene") for make in (doubling, many_primitives, wide_channels)),
     *((make, "a.ply", "mesh") for make in (many_properties, hundred_thousand_properties, many_elements)),
     *((make, "a.ply", "scene") for make in (many_properties, long_lists)),

@@ -1,5 +1,6 @@
-"""Exports that are killed leave a folder beside their file, which the next one there removes."""
+"""Exports that are killed leave a file or folder beside theirs, which the next one there removes."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -69,6 +70,21 @@ def test_folder_of_a_killed_export_is_removed_by_the_next_one(
     assert left.name.startswith(".") and left.name.endswith(".partial") and left.is_dir()
     osp.export("scene.ply", "out/tileset.json")
     assert sorted(path.name for path in (folder / "out").iterdir()) == ["tiles", "tileset.json"]
+
+
+def test_file_of_a_killed_export_is_removed_by_the_next_one(folder: Path) -> None:
+    kill("files.splat", "_splat_rows", EXPORT.format(name="scene.splat"))
+    [left] = (folder / "out").iterdir()
+    assert left.name.startswith(".scene.") and left.name.endswith(".partial.splat")
+    osp.export("scene.ply", "out/scene.splat")
+    assert left.exists()  # just written: another host may be at it, which has its own numbers of processes
+    os.utime(left, (0, 0))
+    others = [Path(f"out/{name}") for name in (".other.9.partial.splat", ".scene.1.partial.splat")]
+    for other in others:
+        other.touch()
+        os.utime(other, (0, 0))
+    osp.export("scene.ply", "out/scene.splat")
+    assert not left.exists() and all(other.exists() for other in others)
 
 
 def test_folders_that_are_in_use_or_of_others_stay(folder: Path) -> None:

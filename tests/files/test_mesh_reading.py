@@ -244,6 +244,21 @@ def test_ply_polygons_become_fans(tmp_path: Path) -> None:
     np.testing.assert_array_equal(mesh.vertices[:, 0], [0, 1, 1, 0])
 
 
+@pytest.mark.parametrize("corner", [-5, -1, 3])
+def test_ply_face_of_no_vertex_is_refused(tmp_path: Path, corner: int) -> None:
+    vertices = np.zeros(
+        3, dtype=[*((name, "<f4") for name in "xyz"), ("nx", "<f4"), ("ny", "<f4"), ("nz", "<f4")]
+    )
+    faces = np.zeros(1, dtype=list_field("vertex_indices", "i4", 3))
+    faces["vertex_indices"], faces["vertex_indices" + COUNT_SUFFIX] = [0, 1, corner], 3
+    path = tmp_path / "mesh.ply"
+    elements = (("vertex", vertices), ("face", faces))
+    write_ply(path, [PlyWriteElement(name, len(rows), rows.dtype, [rows]) for name, rows in elements])
+    for with_materials in (False, True):
+        with pytest.raises(SceneFileError, match="names a vertex that is not there"):
+            read_mesh(path, with_materials=with_materials)
+
+
 def test_ply_with_lists_at_its_vertices_is_read(tmp_path: Path) -> None:
     # trimesh 5 writes colors so.
     fields = [*((name, "<f4") for name in "xyz"), *list_field("color", "u1", 4), ("s", "<f8"), ("t", "<f8")]

@@ -291,6 +291,11 @@ def test_channels_are_attributes_of_every_corner(make_scene: Make, tmp_path: Pat
         for name, values in (("_ALBEDO", albedo), ("_SPECTRUM", spectrum)):
             for place in range(values.shape[1]):
                 np.testing.assert_array_equal(primitive[f"{name}_{place}"], values[ids, place])
+    back, _ = read_scene(tmp_path / "a.glb")
+    shown = octagon_radii(scene.opacities) > 0
+    assert back.channels.widths == scene.channels.widths
+    for name, values in scene.channels.items():
+        np.testing.assert_array_equal(back.channels[name], values[shown])
 
 
 def test_lit_octagons_have_their_own_materials(make_scene: Make, tmp_path: Path) -> None:

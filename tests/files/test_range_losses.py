@@ -52,6 +52,20 @@ def test_spz_tells_sizes_that_it_clips_and_the_scale_that_fits(
     np.testing.assert_allclose(np.sort(back, axis=1), np.sort(scaled.log_scales, axis=1), atol=0.04)
 
 
+@pytest.mark.parametrize("name", ["a.ply", "a.splat", "a.sog", "a.compressed.ply", "a.splats.glb"])
+def test_scene_as_small_as_gaussians_are_thick_is_told(make_gaussians: Make, name: str) -> None:
+    scene = with_sizes(make_gaussians(300), 1e-6, 1e-5)
+    told = losses(scene, name)
+    assert "1e-05 units thick, which is much for the size of 300 of 300" in told
+    assert "octasplat transform --scale 1e+03" in told
+    bigger = replace(scene, log_scales=(scene.log_scales + np.log(1e3)).astype(np.float32))
+    assert "thick" not in losses(bigger, name)
+    # some small ones do not matter in a scene of another size
+    few = replace(bigger, log_scales=bigger.log_scales.copy())
+    few.log_scales[:20] = np.log(1e-6)
+    assert "thick" not in losses(few, name)
+
+
 def test_spz_tells_more_gaussians_than_its_own_reader_takes(
     make_gaussians: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:

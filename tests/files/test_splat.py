@@ -25,6 +25,13 @@ def test_splat_known_bytes_are_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(gaussians.rotations[1, :, 0], [-1, 0, 0], atol=1e-6)
 
 
+def test_splat_whose_first_number_begins_as_gzip_is_read(tmp_path: Path) -> None:
+    (tmp_path / "a.splat").write_bytes(b"\x1f\x8b\x40\x3f" + row()[4:])
+    np.testing.assert_allclose(
+        read_scene(tmp_path / "a.splat")[0].means_world, [[0.75212, -2, 3.5]], atol=1e-5
+    )
+
+
 def test_bytes_at_the_ends_are_no_infinite_logits(tmp_path: Path) -> None:
     data = bytearray(row() * 2)
     data[27], data[32 + 27] = 0, 255

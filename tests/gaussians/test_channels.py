@@ -42,6 +42,7 @@ def test_numbers_with_a_gap_or_alone_are_names() -> None:
     [
         {"3d": 1}, {"a-b": 1}, {"": 1}, {"opacity": 1}, {"scale": 3}, {"scale_9": 1}, {"GID": 1}, {"red": 1},
         {"f_rest": 45}, {"a_0": 1, "a_1": 1}, {"a": 2, "a_2": 1}, {"a": 2, "a_0": 1}, {"b": 1, "B": 1},
+        {"filter_3D": 1}, {"f_rest_weight": 1}, {"f_offset": 3}, {"f_anchor_feat": 32},
     ],
 )  # fmt: skip
 def test_ambiguous_channel_names_are_refused(widths: dict[str, int]) -> None:
