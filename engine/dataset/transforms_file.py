@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import pycolmap
 from jaxtyping import Int64
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from octasplat.engine.core.colmap_binding import pycolmap
 from octasplat.engine.core.errors import DatasetError, SceneFileError
 from octasplat.engine.core.ply_container import read_ply
 from octasplat.engine.dataset.colmap_records import CameraRecord, ImageRecord, ModelRecords, PointRecord
