@@ -177,11 +177,12 @@ def _find_images(
     )
     missing = [name for name in names if name not in found]
     if missing:
+        without_them = "take them out of that file" if model.folder.is_file() else "run COLMAP without them"
         unread = sorted(match_image_names(missing, files_below(folder).keys() - on_disk.keys()).values())
         raise DatasetError(
             f"{len(missing)} of {len(names)} images of the model are not in {folder} "
             f"({name_list(missing)}); "
-            + (" ".join(left_out_sentences(unread)) or "put them there or run COLMAP without them.")
+            + (" ".join(left_out_sentences(unread)) or f"put them there or {without_them}.")
         )
     respelt = {name: found[name] for name in names if normalize_name(name) != found[name]}
     # Transforms files leave out suffixes, which is no other spelling.
