@@ -34,7 +34,12 @@ from octasplat.engine.dataset.model_sources import (
     other_models,
     posed_image_count,
 )
-from octasplat.engine.dataset.photograph_files import files_below, image_folder, photographs_below
+from octasplat.engine.dataset.photograph_files import (
+    files_below,
+    image_folder,
+    no_folder_sentence,
+    photographs_below,
+)
 from octasplat.engine.dataset.views_file import capped_size
 
 
@@ -130,7 +135,7 @@ def require_masks(model: DatasetModel) -> None:
 def _check_root(root: Path, *, has_found_model: bool) -> None:
     """Refuse a folder without photographs, or without poses unless a model was found for it."""
     if not root.is_dir():
-        raise DatasetError(f"{root} is not a folder; name the folder that holds the photographs.")
+        raise DatasetError(no_folder_sentence(root))
     if (
         not has_found_model
         and image_folder(root) == root

@@ -5,10 +5,17 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from octasplat.engine.core.relative_paths import normalize_name
-from octasplat.engine.core.scene_layout import IMAGES, is_ignored_file, is_photograph
+from octasplat.engine.core.scene_layout import ARCHIVE_SUFFIXES, IMAGES, is_ignored_file, is_photograph
 from octasplat.engine.dataset.results_among import is_run_folder
 
 _PHOTOGRAPH_FOLDERS = ("images", "input")
+
+
+def no_folder_sentence(scene: Path) -> str:
+    """Return what to say where a scene is to be a folder and is none, as a ZIP file that jobs would take."""
+    if scene.is_file() and scene.suffix.lower() in ARCHIVE_SUFFIXES:
+        return f"{scene} is an archive; unpack it and name its folder, or octasplat submit it to a service."
+    return f"{scene} is not a folder; name the folder that holds the photographs."
 
 
 def image_folder(root: Path) -> Path:
