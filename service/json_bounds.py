@@ -89,6 +89,11 @@ def find_excess(body: bytes, max_values: int = MAX_VALUES) -> tuple[str, str] | 
     """
     if json.detect_encoding(body) not in ("utf-8", "utf-8-sig"):
         return "encoding", "JSON is read in UTF-8 only."  # the parser takes others, whose brackets differ
+    try:
+        body.decode()
+    except UnicodeDecodeError:
+        more = "The body is no text in UTF-8, in which JSON is read; send it so, and not compressed."
+        return "encoding", more
     too_many = ("too_many_values", f"The request has more than {max_values} values.")
     # Texts are cut out first, as brackets and commas within them are none.
     pieces, end = [], 0

@@ -8,7 +8,8 @@ from octasplat.service.problems import ProblemError
 
 MAX_RANGES = 20
 """A request for more is answered with the whole content."""
-_SPECIFIER = re.compile(r"([0-9]{1,18})-([0-9]{0,18})|-([0-9]{1,18})")
+# As many digits as no length has, and still few to read.
+_SPECIFIER = re.compile(r"([0-9]{1,100})-([0-9]{0,100})|-([0-9]{1,100})")
 
 
 def requested_ranges(request: Request, etag: str, size_bytes: int) -> list[tuple[int, int]] | None:

@@ -54,6 +54,11 @@ _GEOMETRY_FILE = re.compile(r"geometry\.(ply|obj|glb|las|laz)", re.IGNORECASE)
 _POSES_FILE = re.compile(r"transforms(_train|_test|_val)?\.json")
 _POINTS_FILE = re.compile(r"[^/]+\.ply", re.IGNORECASE)
 _MODEL_ELSEWHERE = re.compile(r"(.*/)?images\.(bin|txt)")
+# Of Metashape, Bundler, VisualSFM, OpenSfM and Polycam.
+_POSES_OF_OTHERS = re.compile(
+    r"(.*/)?(cameras\.xml|bundle\.out|[^/]+\.nvm|reconstruction\.json|(corrected_)?cameras/[^/]+\.json)",
+    re.IGNORECASE,
+)
 # "Icon\r" is the icon of a folder on macOS; "." and ".." are not hidden files.
 _IGNORED_FILE = re.compile(
     r"(^|/)(__MACOSX/|\.(?!\.?(/|$))[^/]*|thumbs\.db$|desktop\.ini$|Icon\r?$)", re.IGNORECASE
@@ -77,6 +82,9 @@ class FileRole(Enum):
 
 
 _DEPTHS = tuple((folder,) for folder in DEPTH_FOLDERS)
+_MAP_FOLDERS = (*_DEPTHS, ("confidence",))
+_MAP_SUFFIXES = frozenset({".png", ".tif", ".tiff", ".exr"})
+_PHOTOGRAPH_FOLDERS = (("images",), ("input",))
 _KEPT_ROLES = (FileRole.MODEL, FileRole.MASK, FileRole.DEPTH, FileRole.CONTROL, FileRole.GEOMETRY)
 """Roles of files that keep their names; photographs are moved to ``images/``."""
 _ROLES_BY_FOLDER = {
@@ -158,8 +166,14 @@ def is_photograph(name: str, results: Iterable[str] = ()) -> bool:
         results: folders of runs, with their slashes.
     """
     folders = PurePosixPath(name).parts[:-1]
-    is_map = "masks" in folders or folders[:1] in _DEPTHS
+    is_map = "masks" in folders or folders[:1] in _DEPTHS or _is_map_of_camera(name, folders)
     return _is_picture(name) and not is_map and not any(name.startswith(folder) for folder in results)
+
+
+def _is_map_of_camera(name: str, folders: tuple[str, ...]) -> bool:
+    """Return whether a file is what depth cameras write for each photograph, in a folder further below."""
+    is_precise = PurePosixPath(name).suffix.lower() in _MAP_SUFFIXES  # photographs are JPEG there
+    return is_precise and folders[-1:] in _MAP_FOLDERS and folders[:1] not in _PHOTOGRAPH_FOLDERS
 
 
 def results_folders(names: Iterable[str]) -> tuple[str, ...]:
@@ -282,7 +296,8 @@ def _kind_of(path: str) -> str:
     if suffix in ARCHIVE_SUFFIXES:
         return "archive"
     is_transforms = pure.name.startswith("transforms") and suffix == ".json"
-    return "poses" if is_transforms or _MODEL_ELSEWHERE.fullmatch(path) else "other"
+    is_poses = is_transforms or _MODEL_ELSEWHERE.fullmatch(path) or _POSES_OF_OTHERS.fullmatch(path)
+    return "poses" if is_poses else "other"
 
 
 def _is_picture(name: str) -> bool:

@@ -4,8 +4,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float64
+
+from octasplat.engine.core.colmap_binding import pycolmap
 
 ROUND_TRIP_TOLERANCE_PX = 0.1
 """Directions that project back farther than this from their pixel are not un-projections at all."""

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float64, Int64
 
+from octasplat.engine.core.colmap_binding import pycolmap
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.dataset.colmap_records import CameraRecord, ImageRecord, ModelRecords, PointRecord
 

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float64, Int64
 
+from octasplat.engine.core.colmap_binding import pycolmap
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.local_origin import NO_ORIGIN, Origin, choose_origin
 from octasplat.engine.dataset.camera import Camera

@@ -5,8 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import pycolmap
-
+from octasplat.engine.core.colmap_binding import pycolmap
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.dataset.colmap_binary import (
     Observations,

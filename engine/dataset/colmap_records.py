@@ -4,8 +4,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float64, Int64
+
+from octasplat.engine.core.colmap_binding import pycolmap
 
 NO_POINT = -1
 """Stands for the point of an observation that has none."""

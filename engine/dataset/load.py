@@ -34,7 +34,12 @@ from octasplat.engine.dataset.model_sources import (
     other_models,
     posed_image_count,
 )
-from octasplat.engine.dataset.photograph_files import files_below, image_folder, photographs_below
+from octasplat.engine.dataset.photograph_files import (
+    files_below,
+    image_folder,
+    no_folder_sentence,
+    photographs_below,
+)
 from octasplat.engine.dataset.views_file import capped_size
 
 
@@ -130,7 +135,7 @@ def require_masks(model: DatasetModel) -> None:
 def _check_root(root: Path, *, has_found_model: bool) -> None:
     """Refuse a folder without photographs, or without poses unless a model was found for it."""
     if not root.is_dir():
-        raise DatasetError(f"{root} is not a folder; name the folder that holds the photographs.")
+        raise DatasetError(no_folder_sentence(root))
     if (
         not has_found_model
         and image_folder(root) == root
@@ -177,11 +182,12 @@ def _find_images(
     )
     missing = [name for name in names if name not in found]
     if missing:
+        without_them = "take them out of that file" if model.folder.is_file() else "run COLMAP without them"
         unread = sorted(match_image_names(missing, files_below(folder).keys() - on_disk.keys()).values())
         raise DatasetError(
             f"{len(missing)} of {len(names)} images of the model are not in {folder} "
             f"({name_list(missing)}); "
-            + (" ".join(left_out_sentences(unread)) or "put them there or run COLMAP without them.")
+            + (" ".join(left_out_sentences(unread)) or f"put them there or {without_them}.")
         )
     respelt = {name: found[name] for name in names if normalize_name(name) != found[name]}
     # Transforms files leave out suffixes, which is no other spelling.

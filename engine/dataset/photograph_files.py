@@ -1,13 +1,21 @@
 """The files of a scene's photographs on disk."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 from octasplat.engine.core.relative_paths import normalize_name
-from octasplat.engine.core.scene_layout import IMAGES, is_ignored_file, is_photograph
+from octasplat.engine.core.scene_layout import ARCHIVE_SUFFIXES, IMAGES, is_ignored_file, is_photograph
 from octasplat.engine.dataset.results_among import is_run_folder
 
 _PHOTOGRAPH_FOLDERS = ("images", "input")
+
+
+def no_folder_sentence(scene: Path) -> str:
+    """Return what to say where a scene is to be a folder and is none, as a ZIP file that jobs would take."""
+    if scene.is_file() and scene.suffix.lower() in ARCHIVE_SUFFIXES:
+        return f"{scene} is an archive; unpack it and name its folder, or octasplat submit it to a service."
+    return f"{scene} is not a folder; name the folder that holds the photographs."
 
 
 def image_folder(root: Path) -> Path:
@@ -33,17 +41,31 @@ def _within(folder: Path) -> str:
 
 def files_below(folder: Path) -> dict[str, Path]:
     """Return files by their NFC-normalised path below ``folder``, without hidden ones and results of runs."""
-    files: dict[str, Path] = {}
-    for parent, folders, names in os.walk(folder, followlinks=True):
-        folders[:] = sorted(
-            name for name in folders if not name.startswith(".") and not is_run_folder(Path(parent) / name)
-        )
-        for name in sorted(names):
-            if not name.startswith("."):
-                path = Path(parent) / name
-                # File systems differ in how they spell an umlaut; models come from other machines.
-                files[normalize_name(path.relative_to(folder).as_posix())] = path
-    return files
+    # File systems differ in how they spell an umlaut; models come from other machines.
+    return {normalize_name(path.relative_to(folder).as_posix()): path for path in _walk(folder, frozenset())}
+
+
+def _walk(folder: Path, above: frozenset[str]) -> Iterator[Path]:
+    """Yield the files below a folder, sorted; ``above`` has where the folders lie that it was reached by."""
+    place = os.path.realpath(folder)
+    # A link back to one of these would show every photograph again, as often as links may be followed.
+    if place in above:
+        return
+    try:
+        with os.scandir(folder) as found:
+            entries = sorted((entry for entry in found if not entry.name.startswith(".")), key=_by_name)
+    except OSError:
+        return
+    for entry in entries:
+        path = folder / entry.name
+        if not path.is_dir():
+            yield path
+        elif not is_run_folder(path):
+            yield from _walk(path, above | {place})
+
+
+def _by_name(entry: os.DirEntry[str]) -> str:
+    return entry.name
 
 
 def photographs_below(folder: Path) -> dict[str, Path]:

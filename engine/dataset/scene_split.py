@@ -60,7 +60,12 @@ def split_scene(model: DatasetModel, rule: SplitRule) -> SceneSplit:
         of_scene = f"{model.model_folder} holds out {len(model.held_out)} views"
         if held_out is None and rule.test_every and rule.split == "given":
             held_out = model.held_out
-            warnings.append(f"{of_scene}, which are measured; split=every holds out every n-th view instead.")
+            instead = "split=every holds out every n-th view instead."
+            warnings.append(
+                f"{of_scene}, which are measured; {instead}"
+                if held_out
+                else f"{model.model_folder} holds out no views, so nothing is measured; {instead}"
+            )
         else:
             warnings.append(f"{of_scene}; this run holds out others, as asked.")
     duplicates = find_duplicates(model)

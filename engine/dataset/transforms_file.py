@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import pycolmap
 from jaxtyping import Int64
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from octasplat.engine.core.colmap_binding import pycolmap
 from octasplat.engine.core.errors import DatasetError, SceneFileError
+from octasplat.engine.core.name_lists import name_list
 from octasplat.engine.core.ply_container import read_ply
 from octasplat.engine.dataset.colmap_records import CameraRecord, ImageRecord, ModelRecords, PointRecord
 
@@ -132,8 +133,8 @@ def read_transforms(path: Path, sizes_of: SizesOf) -> TransformsModel:
     files = [_read_file(part) for part in parts]
     if len(files) > 1:
         held_out = [photograph_name(frame.file_path) for frame in files[1].frames]
-    elif (named := files[0].test_filenames or files[0].val_filenames) is not None:
-        held_out = [photograph_name(name) for name in named]
+    else:
+        files[0], held_out = _follow_lists(path, files[0], notes)
     cameras: dict[tuple[object, ...], CameraRecord] = {}
     images: dict[int, ImageRecord] = {}
     masks: dict[str, str] = {}
@@ -183,6 +184,30 @@ def _read_file(path: Path) -> _File:
     if not file.frames:
         raise DatasetError(f"{path} has no frames; write it anew.")
     return file
+
+
+def _follow_lists(path: Path, file: _File, notes: list[str]) -> tuple[_File, list[str] | None]:
+    """Return the file without the frames that its lists leave out, and the names to hold out.
+
+    These are those to test with, or else those to validate with; None where the file lists none of either
+    kind. Trained on are those that are listed for it, or else all that are in no list.
+    """
+    lists = file.train_filenames, file.test_filenames, file.val_filenames
+    training, test, validation = ({photograph_name(name) for name in names or ()} for names in lists)
+    held = test or validation
+    if not training:
+        training = {photograph_name(frame.file_path) for frame in file.frames} - test - validation
+    taken = training | held
+    left_out = [each.file_path for each in file.frames if photograph_name(each.file_path) not in taken]
+    kept = [frame for frame in file.frames if photograph_name(frame.file_path) in taken]
+    if left_out:
+        notes.append(
+            f"{path} lists {len(left_out)} photographs neither for training nor to be held out; they are "
+            f"left out ({name_list(left_out, _MAX_NAMES)})."
+        )
+    names = file.test_filenames or file.val_filenames
+    held_out = None if names is None else [photograph_name(name) for name in names]
+    return file.model_copy(update={"frames": kept}), held_out
 
 
 def _unsized_photographs(files: Sequence[_File]) -> list[str]:

@@ -3,9 +3,9 @@
 from collections.abc import Collection, Sequence
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float64
 
+from octasplat.engine.core.colmap_binding import pycolmap
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.dataset.dataset import Dataset
 from octasplat.engine.dataset.image_names import match_image_names

@@ -5,9 +5,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float64
 
+from octasplat.engine.core.colmap_binding import pycolmap
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.georeference import WGS84, Georeference, matrix_rows, similarity_scale
 from octasplat.engine.dataset.dataset import Dataset

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-import pycolmap
 from jaxtyping import Bool, Float64
 
+from octasplat.engine.core.colmap_binding import pycolmap
 from octasplat.engine.core.georeference import Residuals
 
 MIN_POSITIONS = 3

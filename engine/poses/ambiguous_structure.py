@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 from jaxtyping import Bool, Float64, Int64
 from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import ArpackNoConvergence, eigsh
+
+from octasplat.engine.core.colmap_binding import pycolmap
 
 _MAX_INLIER_SHARE_OF_FALSE_PAIR = 0.5
 """A cut is a fold if no more than so many matches across it are kept for one that is broken."""

@@ -11,8 +11,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
+from octasplat.engine.core.colmap_binding import pycolmap
 from octasplat.engine.dataset.photograph_gps import read_latitude_longitude
 from octasplat.engine.poses.config import (
     MAX_FEATURES,

@@ -11,7 +11,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import pycolmap
+from octasplat.engine.core.colmap_binding import pycolmap
 
 POINTS_PER_PHOTOGRAPH = 50
 """Places are solved for with; each point is in several photographs."""

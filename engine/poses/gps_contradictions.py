@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 from jaxtyping import Bool, Float64, Int64
 
+from octasplat.engine.core.colmap_binding import pycolmap
 from octasplat.engine.poses.ambiguous_structure import PairInliers, count_pair_inliers
 from octasplat.engine.poses.local_georeferences import (
     MAX_TURN,

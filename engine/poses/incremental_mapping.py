@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import pycolmap
-
+from octasplat.engine.core.colmap_binding import pycolmap
 from octasplat.engine.core.scene_layout import MIN_PHOTOGRAPHS
 from octasplat.engine.poses.model_selection import photograph_indices
 from octasplat.engine.poses.stored_mappings import StoredMapping

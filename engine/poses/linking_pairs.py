@@ -11,8 +11,8 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
+from octasplat.engine.core.colmap_binding import pycolmap
 from octasplat.engine.poses.config import PRESELECTION_FEATURES, PRESELECTION_MATCHES, PosesConfig
 from octasplat.engine.poses.features import copy_largest_features, look_at_pairs, match_pairs
 from octasplat.engine.poses.pair_proposals import gps_positions_m

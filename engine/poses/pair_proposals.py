@@ -9,9 +9,9 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float64
 
+from octasplat.engine.core.colmap_binding import pycolmap
 from octasplat.engine.poses.config import PROPOSALS_PER_PHOTOGRAPH
 from octasplat.engine.poses.pairs import Pair, neighbor_pairs
 from octasplat.engine.poses.vocabulary import alike_by_vocabulary

@@ -16,7 +16,7 @@ from octasplat.engine.core.scene_layout import (
     too_few_photographs,
 )
 from octasplat.engine.dataset.model_sources import has_model
-from octasplat.engine.dataset.photograph_files import image_folder
+from octasplat.engine.dataset.photograph_files import image_folder, no_folder_sentence
 from octasplat.engine.dataset.results_among import is_run_folder
 
 
@@ -63,7 +63,7 @@ def notes_on_files(scene: Path) -> tuple[str, ...]:
 
 def _check_folder(scene: Path) -> None:
     if not scene.is_dir():
-        raise DatasetError(f"{scene} is not a folder; name the folder that holds the photographs.")
+        raise DatasetError(no_folder_sentence(scene))
     if is_run_folder(scene) and image_folder(scene) == scene:  # its renders would be taken for photographs
         raise DatasetError(
             f"{scene} is the folder of a run; name the folder that holds the photographs it was made of."

@@ -16,10 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 from jaxtyping import Bool, Float64, Int64
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+
+from octasplat.engine.core.colmap_binding import pycolmap
 
 Pose = tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, " 3"]]
 """Rotation and translation, camera from world."""

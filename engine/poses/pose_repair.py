@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import pycolmap
 
+from octasplat.engine.core.colmap_binding import pycolmap
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.events import EventListener
 from octasplat.engine.core.writing import write_json

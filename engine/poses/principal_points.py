@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float64
 
+from octasplat.engine.core.colmap_binding import pycolmap
 from octasplat.engine.core.events import EventListener
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset.colmap_reading import load_model

@@ -10,8 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import pycolmap
-
+from octasplat.engine.core.colmap_binding import pycolmap
 from octasplat.engine.poses.config import PosesConfig
 from octasplat.engine.poses.disambiguation import MappedModels, register_without_pairs_against_gps
 from octasplat.engine.poses.gps_contradictions import GroundPositions

@@ -6,8 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import pycolmap
-
+from octasplat.engine.core.colmap_binding import pycolmap
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.events import CheckpointWritten, EventListener, PhaseProgress, Warned
 from octasplat.engine.core.progress import phase

@@ -15,8 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import pycolmap
-
+from octasplat.engine.core.colmap_binding import pycolmap
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.poses.stored_search import STORED_MAPPINGS
 from octasplat.engine.poses.whole_files import write_model

@@ -12,9 +12,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float32
 
+from octasplat.engine.core.colmap_binding import pycolmap
 from octasplat.engine.core.writing import atomic_replace, write_json
 from octasplat.engine.poses.stored_search import VOCABULARY_FILE, VOCABULARY_RECORD
 

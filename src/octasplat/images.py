@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 from jaxtyping import Float32, Int32
 
-from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError, OutputError
 from octasplat.engine.core.rays import ImageRays
 from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.operation_calls import check_threads, names_checked
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 Background = Literal["black", "white"] | tuple[float, float, float]
 Shading = Literal["materials", "harmonics"]
+_EIGHT_BITS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
+"""Suffixes of formats that hold display values."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +70,10 @@ class Image:
     def save(self, path: PathLike) -> Path:
         """Write an 8-bit PNG of the colors, or an OpenEXR with linear colors, alpha, depth and normals.
 
+        JPEG, TIFF, WebP and BMP hold the same colors as PNG.
+
         Raises:
-            OutputError: the file cannot be written.
+            OutputError: the name is that of another format, or the file cannot be written.
 
         >>> import octasplat as osp
         >>> scene = osp.load("scene.ply")
@@ -82,8 +86,11 @@ class Image:
         if target.suffix.lower() == ".exr":
             layers = exr_layers(self.rgb, alpha=self.alpha, depth=self.depth, normals_world=self.normal)
             write_exr(target, layers)
-        else:
+        elif target.suffix.lower() in _EIGHT_BITS:
             write_png(target, self.rgb)
+        else:
+            # Others hold linear light, such as HDR, or few colors.
+            raise OutputError(f"{target}: a picture is written as {', '.join(_EIGHT_BITS)} or .exr.")
         return target
 
     def __repr__(self) -> str:

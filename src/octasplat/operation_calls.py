@@ -90,8 +90,10 @@ def check_threads(threads: int) -> None:
     """Refuse what is no number of threads.
 
     Raises:
-        ConfigError: it is below 0.
+        ConfigError: it is below 0, or not whole.
     """
+    if not hasattr(threads, "__index__"):
+        raise ConfigError(f"threads: must be a whole number, 0 for all cores (it is {threads!r}).")
     if threads < 0:
         raise ConfigError(f"threads: must be 0, which takes all cores, or more (it is {threads}).")
 

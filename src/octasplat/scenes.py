@@ -148,6 +148,10 @@ class Scene:
         """Natural logarithms of :attr:`scales`."""
         return self.gaussians.log_scales
 
+    @log_scales.setter
+    def log_scales(self, values: Float[np.ndarray, "n 2"]) -> None:
+        _put("log_scales", self.gaussians.log_scales, values)
+
     @property
     def scales(self) -> Float32[np.ndarray, "n 2"]:
         """Standard deviations along the two axes in the plane, world units; a copy, but it can be set."""
@@ -161,6 +165,10 @@ class Scene:
     def opacity_logits(self) -> Float32[np.ndarray, " n"]:
         """Return the logits of :attr:`opacities`, before the sigmoid."""
         return self.gaussians.opacity_logits
+
+    @opacity_logits.setter
+    def opacity_logits(self, values: Float[np.ndarray, " n"]) -> None:
+        _put("opacity_logits", self.gaussians.opacity_logits, values)
 
     @property
     def opacities(self) -> Float32[np.ndarray, " n"]:

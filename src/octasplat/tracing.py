@@ -114,8 +114,8 @@ class Rays:
 
     def __getitem__(self, which: Any) -> "Rays":
         """Return the rays of a slice, a mask or numbers; of a single number, one ray."""
-        if isinstance(which, int):
-            which = [which]
+        if np.ndim(which) == 0 and not isinstance(which, slice):
+            which = [int(which)]
         # An origin that all rays share stays one, whichever of them are chosen.
         shared = len(self.origins) == 1 and len(self) != 1
         origins = self.origins if shared else self.origins[which]

@@ -25,6 +25,19 @@ def test_arrays_are_views_of_the_scene(scene_file: Path) -> None:
     assert not np.allclose(scene.copy().means, before)
 
 
+def test_logarithms_and_logits_are_changed_in_place(scene_file: Path) -> None:
+    scene = osp.load(scene_file)
+    before = scene.copy()
+    scene.log_scales += np.float32(0.5)
+    scene.opacity_logits = scene.opacity_logits - 1
+    np.testing.assert_allclose(scene.log_scales, before.log_scales + 0.5, rtol=1e-6)
+    np.testing.assert_allclose(scene.gaussians.opacity_logits, before.opacity_logits - 1, rtol=1e-6)
+    with pytest.raises(osp.ConfigError, match="log_scales: must be finite"):
+        scene.log_scales = np.full((len(scene), 2), np.inf)
+    with pytest.raises(osp.ConfigError, match="opacity_logits: has the shape"):
+        scene.opacity_logits = np.zeros(3)
+
+
 def test_arrays_of_another_shape_are_refused(scene_file: Path) -> None:
     scene = osp.load(scene_file)
     before = scene.copy()
@@ -135,6 +148,15 @@ def test_saved_pictures_are_read_back(scene_file: Path, tmp_path: Path) -> None:
     assert image.save(tmp_path / "a.exr").stat().st_size > 0
 
 
+@pytest.mark.parametrize("name", ["view.hdr", "view", "view.gif"])
+def test_pictures_of_other_formats_are_refused_by_name(scene_file: Path, tmp_path: Path, name: str) -> None:
+    scene = osp.load(scene_file)
+    image = osp.render(scene, scene.camera(width_px=12, height_px=8))
+    with pytest.raises(osp.OctasplatError, match=r"view(\.\w+)?: .*\.png.*\.exr"):
+        image.save(tmp_path / name)
+    assert not (tmp_path / name).exists()
+
+
 def test_scene_cameras_match_render_command(scene_file: Path, tmp_path: Path) -> None:
     whole = osp.load(scene_file)
     away = float(np.linalg.norm(whole.camera().centre_world))  # the ball has its middle at the origin
@@ -203,6 +225,13 @@ def test_threads_below_zero_are_refused(scene_file: Path) -> None:
     for call in (lambda: osp.render(scene, camera, threads=-1), lambda: osp.trace(scene, camera, threads=-1)):
         with pytest.raises(osp.ConfigError, match=r"^threads: must be 0"):
             call()
+
+
+def test_threads_are_whole(scene_file: Path) -> None:
+    scene = osp.load(scene_file)
+    for threads in (1.5, "2"):
+        with pytest.raises(osp.ConfigError, match="threads: must be"):
+            osp.render(scene, scene.camera(width_px=8, height_px=8), threads=threads)  # type: ignore[call-overload]
 
 
 def test_what_is_no_path_is_not_loaded(scene_file: Path) -> None:

@@ -154,7 +154,7 @@ def test_rays_indexed_by_int_give_one_ray() -> None:
     scene = osp.Scene(make_cloud(np.random.default_rng(3), 40))
     rays = osp.Rays.of(scene.camera(12, 8))
     everything = osp.trace(scene, rays)
-    for number in (45, -1):
+    for number in (45, -1, np.int64(45), torch.tensor(7)):
         assert rays[number].directions.shape == (1, 3)
         torch.testing.assert_close(osp.trace(scene, rays[number]).rgb[0], everything.rgb[number])
 

@@ -25,6 +25,16 @@ def test_dataset_that_is_no_folder_is_refused_in_a_sentence(octasplat, tmp_path:
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize("command", ["estimate", "plan", "reconstruct"])
+def test_archive_is_refused_with_what_to_do(octasplat, tmp_path: Path, command) -> None:
+    (tmp_path / "photos.zip").write_bytes(b"PK")
+    output = ("-o", tmp_path / "run") if command == "reconstruct" else ()
+    result = octasplat(command, tmp_path / "photos.zip", *output)
+    assert result.exit_code == 1
+    assert f"{tmp_path / 'photos.zip'} is an archive; unpack it" in result.stderr
+    assert "octasplat submit" in result.stderr
+
+
 UNDECODABLE = os.fsdecode(b"\xff\xfe.ply")
 """A name of bytes that are no UTF-8, as of files from other systems."""
 

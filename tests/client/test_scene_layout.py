@@ -59,6 +59,19 @@ FOLDERS = {
     "images without photographs": ((*PHOTOGRAPHS, "images/readme.txt"), PHOTOGRAPHS),
     "scene in a folder": ((*(f"fox/images/{name}" for name in PHOTOGRAPHS), "fox/x.md"), PHOTOGRAPHS),
     "archive inside": ((*PHOTOGRAPHS, "more.zip"), PHOTOGRAPHS),
+    "maps of Polycam": (
+        (
+            *(f"keyframes/images/{name}" for name in PHOTOGRAPHS),
+            *(f"keyframes/{maps}/1.png" for maps in ("depth", "confidence")),
+            "keyframes/cameras/1.json",
+            "mesh_info.json",
+        ),
+        tuple(f"keyframes/images/{name}" for name in PHOTOGRAPHS),
+    ),
+    "photographs in a folder called depth": (
+        (*(f"trip/depth/{name}" for name in PHOTOGRAPHS), "c.jpg"),
+        (*(f"trip/depth/{name}" for name in PHOTOGRAPHS), "c.jpg"),
+    ),
 }
 LIMITS = UploadLimits()
 
@@ -240,6 +253,13 @@ def test_files_left_out_are_told_by_kind_with_the_way_out() -> None:
     assert "1 files look like photographs" in told[0] and "images/b.HEIC" in told[0] and "convert" in told[0]
     assert "c.jpg" in told[1] and "v.MOV" in told[2] and "transforms.json" in told[3]
     assert "sparse/0/project.ini" in told[4] and len(told) == 5
+
+
+def test_poses_of_other_programs_are_told_as_poses() -> None:
+    poses = ["bundle.out", "cameras.xml", "keyframes/cameras/1.json", "reconstruction.json", "scene.nvm"]
+    told = left_out_sentences([*poses, "notes.json"])
+    assert len(told) == 2 and told[0].startswith("5 files hold poses that are not read (bundle.out, ")
+    assert "COLMAP model into sparse/0" in told[0] and "(notes.json)" in told[1]
 
 
 @pytest.mark.parametrize("name", ["images/a?.jpg", "images/con.jpg", "images/a.jpg ./b.jpg"])

@@ -83,6 +83,20 @@ def test_nested_folders_and_odd_names(tmp_path, make_scene, coded):
     assert all(view.image_path.is_file() for view in scene.views)
 
 
+def test_a_link_back_into_the_photographs_shows_none_of_them_twice(tmp_path, make_scene):
+    root = make_scene(tmp_path / "scene")
+    (root / "images" / "again").symlink_to(".")
+    (root / "images" / "above").symlink_to("../..")
+    other = make_scene(tmp_path / "other")
+    (root / "masks").symlink_to(other / "images")
+    scene = load_dataset_model(root)
+    assert [view.name for view in scene.views] == [f"view_{i}.png" for i in range(4)]
+    unposed = [text for text in scene.warnings if "have no pose" in text]
+    assert all("again" not in text for text in unposed)
+    # What the link above leads to is there once: the other scene's photographs.
+    assert len(unposed) == 1 and unposed[0].startswith("4 images in")
+
+
 def test_dataset_unicode_names_match_across_normal_forms(tmp_path, make_scene):
     root = make_scene(tmp_path)
     (root / "images/view_1.png").rename(root / "images" / unicodedata.normalize("NFD", "ü.png"))

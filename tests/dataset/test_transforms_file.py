@@ -181,6 +181,42 @@ def test_a_file_names_the_views_to_hold_out(scene: Path) -> None:
     assert [dataset.views[index].name for index in dataset.test_indices] == ["a/frame_003.png"]
 
 
+@pytest.mark.parametrize("lists_training", [True, False])
+def test_views_to_validate_with_are_not_trained_on(scene: Path, lists_training: bool) -> None:
+    root = _copy(scene, "other")
+    frames = _frames(load_dataset_model(scene))
+    names = [frame["file_path"] for frame in frames]
+    lists = {"train_filenames": names[:3]} if lists_training else {}
+    _write(root, frames, **_PINHOLE, **lists, val_filenames=names[3:4], test_filenames=names[4:])
+    dataset = Dataset.open(root, root / "cache")
+    assert [dataset.views[index].name for index in dataset.test_indices] == ["a/frame_004.png"]
+    assert [dataset.views[index].name for index in dataset.train_indices] == [
+        f"a/frame_{index:03d}.png" for index in range(3)
+    ]
+    assert "1 photographs neither for training nor to be held out" in " ".join(dataset.warnings)
+    assert "a/frame_003.png" in " ".join(dataset.warnings)
+
+
+def test_only_the_views_that_are_listed_for_training_are_trained_on(scene: Path) -> None:
+    root = _copy(scene, "other")
+    frames = _frames(load_dataset_model(scene))
+    listed = [f"./{frame['file_path']}" for frame in frames[:4]]
+    _write(root, frames, **_PINHOLE, train_filenames=listed)
+    model = load_dataset_model(root)
+    assert [view.name for view in model.views] == [f"a/frame_{index:03d}.png" for index in range(4)]
+    assert model.held_out is None  # every n-th is held out, as the file says of none
+
+
+def test_a_file_that_holds_out_none_is_followed_and_told(scene: Path) -> None:
+    root = _copy(scene, "other")
+    frames = _frames(load_dataset_model(scene))
+    names = [frame["file_path"] for frame in frames]
+    _write(root, frames, **_PINHOLE, train_filenames=names, val_filenames=[], test_filenames=[])
+    dataset = Dataset.open(root, root / "cache")
+    assert len(dataset.test_indices) == 0
+    assert "holds out no views, so nothing is measured" in " ".join(dataset.warnings)
+
+
 @pytest.mark.parametrize("colors", ["uchar", "uint8", "float"])
 def test_points_are_the_initial_ones(scene: Path, colors: str) -> None:
     root = _copy(scene, "other")

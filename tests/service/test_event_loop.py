@@ -6,6 +6,7 @@ the machine do not lengthen.
 
 import asyncio
 import gc
+import gzip
 import json
 import re
 import threading
@@ -197,6 +198,14 @@ def test_excess_is_found_in_the_structure_alone() -> None:
     ):
         found = find_excess(body)
         assert found is not None and found[0] == code
+
+
+@pytest.mark.parametrize("body", ['{"name": "é"}'.encode("latin-1"), gzip.compress(b'{"name": "a"}')])
+def test_a_body_that_is_no_utf_8_is_refused_with_what_to_do(body: bytes) -> None:
+    assert find_excess(body) == (
+        "encoding",
+        "The body is no text in UTF-8, in which JSON is read; send it so, and not compressed.",
+    )
 
 
 @pytest.mark.parametrize("piece", [b"]", b"9" * 400 + b" ", b'"\\', b"1 "])

@@ -6,6 +6,7 @@ import re
 from typing import Any
 
 import pytest
+from openapi_spec_validator import OpenAPIV31SpecValidator
 
 from octasplat.service.app import create_app
 from tests.support.service_harness import ConnectService, committed_dataset
@@ -15,6 +16,12 @@ from tests.support.service_harness import ConnectService, committed_dataset
 def document() -> dict[str, Any]:
     """The document of a front end."""
     return create_app().openapi()
+
+
+def test_document_is_valid_by_the_schema_of_its_own_version() -> None:
+    served = json.loads(json.dumps(document()))
+    assert served["openapi"].startswith("3.1.")
+    assert [error.message for error in OpenAPIV31SpecValidator(served).iter_errors()] == []
 
 
 def test_operation_ids_are_unique_and_in_camel_case() -> None:

@@ -145,8 +145,6 @@ def run_operation(
         OctasplatError: as the operation does.
         StoppedError: a signal asked to stop.
     """
-    import pycolmap  # noqa: F401 - it takes SIGTERM when imported, as every operation does, so before we do
-
     if is_stoppable:
         with request_stop_on_signals() as should_stop:
             try:

@@ -40,8 +40,7 @@ class StopFlag:
 def request_stop_on_signals() -> Iterator[StopFlag]:
     """Inside the block, a first SIGINT or SIGTERM only sets the flag; a second one kills at once.
 
-    To be entered after all imports, as :func:`exit_on_sigterm`. Outside of the main thread,
-    where Python allows no handlers, the flag just stays unset.
+    Outside of the main thread, where Python allows no handlers, the flag just stays unset.
     """
     flag = StopFlag()
     if threading.current_thread() is not threading.main_thread():
@@ -67,10 +66,7 @@ def request_stop_on_signals() -> Iterator[StopFlag]:
 
 @contextmanager
 def exit_on_sigterm() -> Iterator[None]:
-    """Inside the block, SIGTERM unwinds the program (exit code 143), so that unfinished files are removed.
-
-    To be entered after all imports: pycolmap takes SIGTERM for itself, to print a stack trace.
-    """
+    """Inside the block, SIGTERM unwinds the program (exit code 143), so that unfinished files are removed."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -3,8 +3,8 @@
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
+from octasplat.engine.core.colmap_binding import pycolmap
 from octasplat.engine.dataset.synthetic.points import SurfacePoints
 from octasplat.engine.dataset.synthetic.synthetic_views import SyntheticView
 

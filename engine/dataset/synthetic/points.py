@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-import pycolmap
 from jaxtyping import Bool, Float, Int, UInt8
 
+from octasplat.engine.core.colmap_binding import pycolmap
 from octasplat.engine.core.color import to_bytes
 from octasplat.engine.dataset.synthetic.config import SyntheticDatasetConfig
 from octasplat.engine.dataset.synthetic.lit_scene import LitScene

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float, Float32
 
+from octasplat.engine.core.colmap_binding import pycolmap
 from octasplat.engine.dataset.synthetic.config import SyntheticDatasetConfig
 from octasplat.engine.dataset.synthetic.street import half_length
 
