@@ -8,11 +8,24 @@ import pytest
 from scipy.stats import chi2
 
 from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.pathtracing.compile_meshes import compile_meshes
 from octasplat.engine.pathtracing.environment import EnvironmentMap, environment_frame
 from octasplat.engine.pathtracing.lights import build_light_arrays, eval_environment_map
-from octasplat.engine.pathtracing.stage.model import DirectionalLight, PointLight, RectangleLight, SpotLight
-from octasplat.engine.render.environment_files import read_environment, write_environment
+from octasplat.engine.pathtracing.stage.model import (
+    DirectionalLight,
+    Environment,
+    PointLight,
+    RectangleLight,
+    SpotLight,
+    Stage,
+)
+from octasplat.engine.render.environment_files import (
+    read_environment,
+    write_background_map,
+    write_environment,
+)
 from octasplat.engine.render.image_files import write_exr
+from octasplat.engine.shading.background import LearnedBackground
 from tests.support.light_samples import sample_lights
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -145,6 +158,16 @@ def test_environment_rotation_turns_map() -> None:
     assert eval_environment_map(level, np.array([[1.0, 0.0, 0.0]]))[0][0, 0] == 1.0
     turned = build_light_arrays((), UP, EnvironmentMap(radiance, environment_frame(UP, 90.0)))
     assert eval_environment_map(turned, np.array([[0.0, 1.0, 0.0]]))[0][0, 0] == pytest.approx(1.0)
+
+
+def test_background_of_a_run_lies_in_a_tilted_stage_as_it_was_learnt(tmp_path: Path) -> None:
+    learnt = LearnedBackground(16)
+    write_background_map(tmp_path / "background.exr", learnt.rgb_srgb)
+    tilted = (0.2, -0.9, 0.3)
+    for up, frame in (((0.0, -1.0, 0.0), learnt.frame), (None, environment_frame(np.array(tilted)))):
+        stage = Stage(up=tilted, environment=Environment(file="background.exr", up=up))
+        lights = compile_meshes(stage, tmp_path, threads=1).lights
+        np.testing.assert_allclose(lights.environment_frame, frame, atol=1e-12)
 
 
 def test_environment_invalid_image_is_refused(tmp_path: Path) -> None:
