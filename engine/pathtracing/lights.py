@@ -24,6 +24,7 @@ from octasplat.engine.pathtracing.kernels.kernel_args import (
     SPOT,
     LightArrays,
 )
+from octasplat.engine.pathtracing.kernels.texture import TEXTURE_COLUMNS
 from octasplat.engine.pathtracing.mesh_shapes import primitive_shape
 from octasplat.engine.pathtracing.stage.model import (
     DirectionalLight,
@@ -110,7 +111,7 @@ def build_light_arrays(
     environment: EnvironmentMap | None = None,
     meshes: Sequence[EmissiveMesh] = (),
     texels_linear: Float32[np.ndarray, "x 3"] | None = None,
-    texture_sizes: Int64[np.ndarray, "k 3"] | None = None,
+    texture_sizes: Int64[np.ndarray, "k 6"] | None = None,
     *,
     found_by_paths: bool = True,
 ) -> LightArrays:
@@ -201,7 +202,7 @@ def build_light_arrays(
         mesh_uv=tables.uv,
         mesh_alpha=tables.alpha,
         texels_linear=np.zeros((0, 3), np.float32) if texels_linear is None else texels_linear,
-        texture_sizes=np.zeros((0, 3), np.int64) if texture_sizes is None else texture_sizes,
+        texture_sizes=np.zeros((0, TEXTURE_COLUMNS), np.int64) if texture_sizes is None else texture_sizes,
         environment_linear=radiance,
         environment_row_cdf=sampler.row_cdf,
         environment_column_cdf=sampler.column_cdf,
