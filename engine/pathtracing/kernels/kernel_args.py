@@ -240,11 +240,15 @@ class Bsdf(NamedTuple):
 
 
 class SurfacePoint(NamedTuple):
-    """A point of a surface, its normal on the viewer's side, and the one that it is shaded by."""
+    """A point of a surface, its normal on the viewer's side, and the one that it is shaded by.
+
+    Rays that go on begin ``ray_step`` off the surface; it is 0 where the point is off it already.
+    """
 
     position: Vec3
     normal: Vec3
     shading_normal: Vec3
+    ray_step: float
 
 
 class AlbedoTables(NamedTuple):
