@@ -35,6 +35,10 @@ from octasplat.engine.pathtracing.stage.model import (
 )
 
 
+LEAST_RADIUS = 1e-15
+"""Balls of light that are smaller are points: the radiance of them would leave what numbers hold."""
+
+
 class Opacity(NamedTuple):
     """What is there of a surface.
 
@@ -150,7 +154,7 @@ def build_light_arrays(
             if isinstance(light, SpotLight):
                 kinds[l] = SPOT
                 cosines[l] = np.cos(np.radians([light.outer_degrees, light.inner_degrees]))
-            elif light.radius > 0.0:
+            elif light.radius > LEAST_RADIUS:
                 areas[l] = np.pi * light.radius**2
                 # intensity = radiance times the disc's area
                 kinds[l], rgb[l], visibility[l] = SPHERE, rgb[l] / areas[l], light.visible
@@ -234,7 +238,7 @@ def light_triangles(light: Light, up_world: Float64[np.ndarray, "3"]) -> Float32
     """Return the triangles of a visible light; None of an invisible one."""
     if light.only_shadows:
         return None
-    if isinstance(light, PointLight) and light.radius > 0.0 and light.visible:
+    if isinstance(light, PointLight) and light.radius > LEAST_RADIUS and light.visible:
         ball = primitive_shape("sphere")
         corners = ball.vertices[ball.faces] * light.radius + np.array(light.position)
         return np.asarray(corners.astype(np.float32))

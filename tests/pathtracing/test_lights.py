@@ -58,6 +58,17 @@ def test_parallel_rectangle_form_factor() -> None:
     np.testing.assert_allclose(irradiance(samples), 4 * corner * np.pi * 3.0, rtol=2e-3)
 
 
+@pytest.mark.parametrize("radius", [1e-30, 1e-200])
+def test_ball_as_small_as_it_likes_lights_as_a_point(radius: float) -> None:
+    point, ball = (PointLight(position=(0, 0, 0), intensity=3, radius=each) for each in (0.0, radius))
+    points = np.random.default_rng(0).normal(size=(16, 3))
+    wanted, found = (
+        sample_lights(build_light_arrays((lamp,), UP), points, stratified(4)) for lamp in (point, ball)
+    )
+    for one, other in zip(wanted, found, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 def test_rectangle_light_back_side_is_black() -> None:
     light = RectangleLight(position=(0, 0, 1), direction=(0, 0, 1), width=1, height=1, radiance=3.0)
     assert (
