@@ -34,7 +34,6 @@ from octasplat.engine.pathtracing.stage.model import (
     SpotLight,
 )
 
-
 LEAST_RADIUS = 1e-15
 """Balls of light that are smaller are points: the radiance of them would leave what numbers hold."""
 
