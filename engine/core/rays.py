@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Float, Float32, Float64, Int
 
 AT_INFINITY = -np.inf
 """Viewer of rays whose colors are those in their own direction."""
@@ -162,11 +162,16 @@ def concatenate_rays(first: RayBatch, second: RayBatch) -> RayBatch:
 
 @dataclass(frozen=True)
 class ImageRays:
-    """The rays through the pixels of an image, row by row; all have one origin."""
+    """The rays through the pixels of an image, row by row; all have one origin.
+
+    ``axis_world`` is the camera's axis, a unit vector, which need not lead through the middle of the image;
+    None where only the rays are known.
+    """
 
     rays: RayBatch
     height_px: int
     width_px: int
+    axis_world: Float64[np.ndarray, "3"] | None = None
 
     @classmethod
     def from_directions(
@@ -174,11 +179,13 @@ class ImageRays:
         origin_world: Float[np.ndarray, "3"],
         directions_world: Float[np.ndarray, "h w 3"],
         near_world: float = 0.0,
+        axis_world: Float[np.ndarray, "3"] | None = None,
     ) -> "ImageRays":
         """Return rays along unit directions that see nothing nearer than ``near_world``."""
         height, width = directions_world.shape[:2]
         rays = RayBatch(origin_world[None], directions_world.reshape(-1, 3), near_world)
-        return cls(rays, height, width)
+        axis = None if axis_world is None else np.array(axis_world, np.float64)
+        return cls(rays, height, width, axis)
 
     def shifted(self, across_px: float, down_px: float) -> "ImageRays":
         """Return the rays offset from the pixel centres, by finite differences of their neighbours."""
@@ -189,7 +196,7 @@ class ImageRays:
             if ways.shape[axis] > 1:
                 ways = ways + offset * np.gradient(self.directions_world.astype(np.float64), axis=axis)
         ways /= np.linalg.norm(ways, axis=2, keepdims=True)
-        return ImageRays.from_directions(self.origin_world, ways, float(self.rays.t_min[0]))
+        return ImageRays.from_directions(self.origin_world, ways, float(self.rays.t_min[0]), self.axis_world)
 
     @property
     def origin_world(self) -> Float32[np.ndarray, "3"]:

@@ -6,7 +6,7 @@ glTF 2.0 (https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html) and its ext
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +15,14 @@ from jaxtyping import Float64
 
 from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.files.glb_container import GlbFile
-from octasplat.engine.geometry.mesh_material import FileImage, MeshMaterial
+from octasplat.engine.geometry.mesh_material import FileImage, MeshMaterial, Wrap
 
 SUPPORTED_EXTENSIONS = ("clearcoat", "emissive_strength", "ior", "transmission", "unlit", "volume")
 SUFFIXES = {"image/png": ".png", "image/jpeg": ".jpg", "image/webp": ".webp"}
 KINDS = {b"\x89PNG": ".png", b"\xff\xd8\xff": ".jpg", b"RIFF": ".webp"}
 REPEAT = 10497
-EDGE_TOLERANCE = 1e-3
-"""How far coordinates may lie beyond an image without being meant to."""
+WRAPS: Mapping[int, Wrap] = {REPEAT: "repeat", 33071: "clamp", 33648: "mirror"}
+NEAREST = 9728
 PARTLY_SUPPORTED_EXTENSIONS = {
     "clearcoatNormalTexture", "thicknessTexture", "transmissionTexture"
 }  # fmt: skip
@@ -110,7 +110,7 @@ class _MaterialReader:
             clear_coat_roughness=float(extensions.get("clearcoat", {}).get("clearcoatRoughnessFactor", 0.0)),
             coat_has_normal_texture=self._coat_has_normal_texture(),
             **self._opacity(number, base[3], images.get("texture")),
-            unsupported=self._unsupported_features(number),
+            unsupported=self._unsupported_features(),
             **images,  # type: ignore[arg-type]
         )
 
@@ -160,27 +160,7 @@ class _MaterialReader:
                         return True
         return False
 
-    def _leaves_its_images(self, number: int, infos: Sequence[Mapping[str, Any]]) -> bool:
-        """Return whether coordinates go beyond images that do not repeat there."""
-        document = self._file.document
-        samplers = [
-            document["samplers"][texture["sampler"]]
-            for texture in (document["textures"][info["index"]] for info in infos)
-            if "sampler" in texture
-        ]
-        if all(sampler.get(key, REPEAT) == REPEAT for sampler in samplers for key in ("wrapS", "wrapT")):
-            return False
-        place, matrix = texture_frame(self._material)
-        for mesh in document.get("meshes", []):
-            for primitive in mesh.get("primitives", []):
-                uv = primitive.get("attributes", {}).get(f"TEXCOORD_{place}")
-                if primitive.get("material") == number and uv is not None:
-                    found = self._file.array(uv, np.float64) @ matrix[:, :2].T + matrix[:, 2]
-                    if (np.abs(found - 0.5) > 0.5 + EDGE_TOLERANCE).any():
-                        return True
-        return False
-
-    def _unsupported_features(self, number: int) -> tuple[str, ...]:
+    def _unsupported_features(self) -> tuple[str, ...]:
         """Return what is not understood, in words."""
         material = self._material
         found = [
@@ -198,8 +178,6 @@ class _MaterialReader:
         if self._coat_has_normal_texture():
             found.remove("clearcoatNormalTexture")
         infos = list(_texture_infos(material).values())
-        if self._leaves_its_images(number, infos):
-            found.append("images that are mirrored or end at their edges, as texture coordinates go beyond")
         if len({(i.get("texCoord", 0), str(i.get("extensions"))) for i in infos}) > 1:
             found.append("other texture coordinates than those of its first texture")
         return tuple(found)
@@ -226,4 +204,10 @@ class _MaterialReader:
         kind = next((suffix for start, suffix in KINDS.items() if content.startswith(start)), "")
         suffix = kind or SUFFIXES.get(image.get("mimeType", ""), ".png")
         name = f"{self._path} (image {image.get('name') or info['index']})"
-        return FileImage(name, suffix, content=content)
+        sampler = document["samplers"][texture["sampler"]] if "sampler" in texture else {}
+        wrap = (
+            WRAPS.get(sampler.get("wrapS", REPEAT), "repeat"),
+            WRAPS.get(sampler.get("wrapT", REPEAT), "repeat"),
+        )
+        is_blocky = sampler.get("magFilter") == NEAREST
+        return FileImage(name, suffix, content=content, wrap=wrap, is_blocky=is_blocky)

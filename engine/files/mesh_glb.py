@@ -121,6 +121,9 @@ def _notes(document: dict[str, Any]) -> tuple[str, ...]:
             "skin" in node for node in nodes
         ),
         "Its morph targets are passed over: its vertices stay where they lie.": any(map(any, weights)),
+        "Its lamps (KHR_lights_punctual) are passed over: those of the stage light it.": any(
+            "KHR_lights_punctual" in node.get("extensions", {}) for node in document.get("nodes", [])
+        ),
         "Copies of its meshes (EXT_mesh_gpu_instancing) are passed over: each is shown once.": any(
             "EXT_mesh_gpu_instancing" in node.get("extensions", {}) for node in nodes
         ),

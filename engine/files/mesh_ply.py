@@ -3,6 +3,7 @@
 Octagons: the format to edit in, as mesh editors keep vertex attributes both ways; they are found by name.
 """
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -46,6 +47,8 @@ PATTERNS = (
     *("mesh.ply", "*.mesh.ply", "*_mesh.ply", "*-mesh.ply"),
     *("octagons.ply", "*.octagons.ply", "*_octagons.ply", "*-octagons.ply"),
 )
+_IMAGE = re.compile(r"TextureFile\s+\S", re.IGNORECASE)
+"""How comments of photogrammetry programs begin that name an image."""
 _FACE_LISTS = ("vertex_indices", "vertex_index")
 VERTEX = [
     *((name, "<f4") for name in (*_POSITION, "s", "t")),
@@ -120,8 +123,11 @@ def read_with_materials(path: Path) -> ImportedMesh:
         if table.dtype["red"].kind in "iu":
             colors = colors / np.float32(np.iinfo(table.dtype["red"]).max)
         colors = srgb_to_linear(np.clip(colors, 0.0, 1.0)).astype(np.float32)
+    images = [comment.split(maxsplit=1)[1] for comment in header.comments if _IMAGE.match(comment)]
+    notes = (f"Its image {', '.join(images)} is passed over: a PLY has no materials.",) if images else ()
     return replace(
         mesh,
+        notes=notes,
         corner_uv=None if uv is None else flip_v(uv)[mesh.triangles],
         corner_normals=columns(table, _NORMAL)[mesh.triangles] if set(_NORMAL) <= names else None,
         rgb_linear=colors,

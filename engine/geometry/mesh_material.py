@@ -2,8 +2,12 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from octasplat.engine.core.errors import SceneFileError
+
+Wrap = Literal["repeat", "clamp", "mirror"]
+"""What is beyond the edges of an image: itself again, the color of the edge, or itself mirrored."""
 
 
 @dataclass(frozen=True)
@@ -15,12 +19,16 @@ class FileImage:
         suffix: of the image's format, with its dot.
         content: the encoded image where the mesh file holds it.
         path: the file where the mesh file names it.
+        wrap: beyond its edges to the left and right, and above and below.
+        is_blocky: whether each pixel has one color, rather than a mean of its neighbours.
     """
 
     name: str
     suffix: str
     content: bytes | None = None
     path: Path | None = None
+    wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
+    is_blocky: bool = False
 
 
 @dataclass(frozen=True)

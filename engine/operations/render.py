@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 PREVIEW_SIDE_PX = 480
 STAGE_LACKS_BACKGROUND = (
     "The background that was learnt is left out on a stage; to show it, and to be lit by it, name the run's "
-    "background.exr as the stage's environment."
+    "background.exr as the stage's environment, with up = [0, -1, 0] there."
 )
 STAGE_IS_OPAQUE = (
     "The environment of the stage is seen behind everything, so that no pixel is transparent; with visible = "
@@ -38,7 +38,7 @@ STAGE_IS_OPAQUE = (
 STAGE_LACKS_MATERIALS = (
     "The scene's materials are left out on this stage, and its harmonics shown, which have no sharp "
     'reflections; light = "relit" of [[gaussians]] shows materials in the light of the stage, such as the '
-    "environment.exr of a run."
+    "environment.exr of a run (whose up is its materials.up_world)."
 )
 
 

@@ -140,7 +140,7 @@ def compile_meshes(
         radiance = read_environment(folder / stage.environment.file, warn)
         environment = EnvironmentMap(
             radiance * np.float32(stage.environment.strength),
-            environment_frame(up, stage.environment.rotation_degrees),
+            environment_frame(np.array(stage.environment.up or stage.up), stage.environment.rotation_degrees),
         )
     surfaces, materials = gathered.surfaces(), gathered.table.arrays()
     lights = build_light_arrays(

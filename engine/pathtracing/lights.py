@@ -24,6 +24,7 @@ from octasplat.engine.pathtracing.kernels.kernel_args import (
     SPOT,
     LightArrays,
 )
+from octasplat.engine.pathtracing.kernels.texture import TEXTURE_COLUMNS
 from octasplat.engine.pathtracing.mesh_shapes import primitive_shape
 from octasplat.engine.pathtracing.stage.model import (
     DirectionalLight,
@@ -32,6 +33,9 @@ from octasplat.engine.pathtracing.stage.model import (
     RectangleLight,
     SpotLight,
 )
+
+LEAST_RADIUS = 1e-15
+"""Balls of light that are smaller are points: the radiance of them would leave what numbers hold."""
 
 
 class Opacity(NamedTuple):
@@ -110,7 +114,7 @@ def build_light_arrays(
     environment: EnvironmentMap | None = None,
     meshes: Sequence[EmissiveMesh] = (),
     texels_linear: Float32[np.ndarray, "x 3"] | None = None,
-    texture_sizes: Int64[np.ndarray, "k 3"] | None = None,
+    texture_sizes: Int64[np.ndarray, "k 6"] | None = None,
     *,
     found_by_paths: bool = True,
 ) -> LightArrays:
@@ -149,7 +153,7 @@ def build_light_arrays(
             if isinstance(light, SpotLight):
                 kinds[l] = SPOT
                 cosines[l] = np.cos(np.radians([light.outer_degrees, light.inner_degrees]))
-            elif light.radius > 0.0:
+            elif light.radius > LEAST_RADIUS:
                 areas[l] = np.pi * light.radius**2
                 # intensity = radiance times the disc's area
                 kinds[l], rgb[l], visibility[l] = SPHERE, rgb[l] / areas[l], light.visible
@@ -201,7 +205,7 @@ def build_light_arrays(
         mesh_uv=tables.uv,
         mesh_alpha=tables.alpha,
         texels_linear=np.zeros((0, 3), np.float32) if texels_linear is None else texels_linear,
-        texture_sizes=np.zeros((0, 3), np.int64) if texture_sizes is None else texture_sizes,
+        texture_sizes=np.zeros((0, TEXTURE_COLUMNS), np.int64) if texture_sizes is None else texture_sizes,
         environment_linear=radiance,
         environment_row_cdf=sampler.row_cdf,
         environment_column_cdf=sampler.column_cdf,
@@ -233,7 +237,7 @@ def light_triangles(light: Light, up_world: Float64[np.ndarray, "3"]) -> Float32
     """Return the triangles of a visible light; None of an invisible one."""
     if light.only_shadows:
         return None
-    if isinstance(light, PointLight) and light.radius > 0.0 and light.visible:
+    if isinstance(light, PointLight) and light.radius > LEAST_RADIUS and light.visible:
         ball = primitive_shape("sphere")
         corners = ball.vertices[ball.faces] * light.radius + np.array(light.position)
         return np.asarray(corners.astype(np.float32))

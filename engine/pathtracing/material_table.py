@@ -15,6 +15,7 @@ from octasplat.engine.pathtracing.bsdf_tables import albedo_table, rough_dielect
 from octasplat.engine.pathtracing.kernels.kernel_args import MaterialArrays
 from octasplat.engine.pathtracing.kernels.principled_bsdf import BURLEY, COUPLED
 from octasplat.engine.pathtracing.kernels.surface import DIFFUSE, EMITTER, GLASS, MIRROR, PRINCIPLED
+from octasplat.engine.pathtracing.kernels.texture import TEXTURE_COLUMNS, WRAP_MODES
 from octasplat.engine.pathtracing.lights import Opacity
 from octasplat.engine.pathtracing.stage.materials import (
     ClearCoated,
@@ -80,6 +81,7 @@ class MaterialTable:
         self._albedo_tables: list[tuple[str, float]] = [("coat", 1.5)]
         self._textures: dict[tuple[FileImage, TextureUse], int] = {}
         self._images: list[Float32[np.ndarray, "h w 3"]] = []
+        self._sources: list[FileImage] = []
 
     def add(
         self,
@@ -179,10 +181,11 @@ class MaterialTable:
             albedo_table(ior) if kind == "coat" else rough_dielectric_table(ior)
             for kind, ior in self._albedo_tables
         ]
-        sizes = np.zeros((len(self._images), 3), np.int64)
+        sizes = np.zeros((len(self._images), TEXTURE_COLUMNS), np.int64)
         first = 0
-        for k, image in enumerate(self._images):
-            sizes[k] = first, image.shape[0], image.shape[1]
+        for k, (source, image) in enumerate(zip(self._sources, self._images, strict=True)):
+            wraps = [WRAP_MODES.index(wrap) for wrap in source.wrap]
+            sizes[k] = first, *image.shape[:2], *wraps, source.is_blocky
             first += image.shape[0] * image.shape[1]
         texels = np.concatenate([np.zeros((0, 3), np.float32), *(i.reshape(-1, 3) for i in self._images)])
         return MaterialArrays(
@@ -218,6 +221,7 @@ class MaterialTable:
             self._textures[image, use] = len(self._images)
             most = None if use == "light" else 1.0  # reflectances are at most 1, light is not limited
             self._images.append(np.ascontiguousarray(np.clip(rgb, 0.0, most), np.float32))
+            self._sources.append(image)
             if sum(i.shape[0] * i.shape[1] for i in self._images) > MAX_TEXELS:
                 raise ConfigError(
                     f"{image.name}: the textures have more than {MAX_TEXELS >> 20} million pixels together."

@@ -15,6 +15,9 @@ from octasplat.engine.pathtracing.stage.base import Transformed
 SPHERE_DIVISIONS = 5
 CLOSED_TOLERANCE = 1e-6
 """Share of the area of a closed solid that is left where the areas of its faces are added as vectors."""
+_MOST_DIRECT_COSINE = -0.5
+"""Cosine of the largest angle that an axis is turned to up the shortest way; no up that is nearly one of the
+axes is nearly this."""
 MAX_SOLIDS = 2000
 """So many solids of one mesh, the largest ones, are looked at for what lies within others."""
 
@@ -37,10 +40,12 @@ def rotation_matrix(degrees: tuple[float, float, float]) -> Float64[np.ndarray, 
 
 
 def align_axis_to_up(axis: str, up_world: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
-    """Return the shortest rotation of an axis (``y``, ``-z``, ...) to up; the identity for ``world``.
+    """Return a rotation of an axis (``y``, ``-z``, ...) to up; the identity for ``world``.
 
-    Opposite directions turn about x, or about y where the axis is x: glTF's y to COLMAP's -y is the half
-    turn about x that the project's own GLB files are written with.
+    The shortest one, but where that is more than :data:`_MOST_DIRECT_COSINE` says: then it begins with a half
+    turn about x, or about y where the axis is x. glTF's y to COLMAP's -y is the half turn about x that the
+    project's own GLB files are written with, and an up that differs a little from that turns a mesh a little
+    only. The shortest rotation there would turn it by any angle about up.
     """
     if axis == "world":
         return np.eye(3)
@@ -48,11 +53,19 @@ def align_axis_to_up(axis: str, up_world: Float64[np.ndarray, "3"]) -> Float64[n
     start = np.eye(3)[place] * (-1.0 if axis.startswith("-") else 1.0)
     end = up_world / np.linalg.norm(up_world)
     cosine = float(start @ end)
-    if cosine < -1 + 1e-9:
-        return np.diag([-1.0, 1.0, -1.0]) if place == 0 else np.diag([1.0, -1.0, -1.0])
+    if cosine < _MOST_DIRECT_COSINE:
+        half_turn = np.diag([-1.0, 1.0, -1.0]) if place == 0 else np.diag([1.0, -1.0, -1.0])
+        return _shortest_rotation(-start, end) @ half_turn
+    return _shortest_rotation(start, end)
+
+
+def _shortest_rotation(
+    start: Float64[np.ndarray, "3"], end: Float64[np.ndarray, "3"]
+) -> Float64[np.ndarray, "3 3"]:
+    """Return the shortest rotation from one unit vector to another, which is not its opposite."""
     v = np.cross(start, end)
     cross = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-    return np.eye(3) + cross + cross @ cross / (1 + cosine)
+    return np.asarray(np.eye(3) + cross + cross @ cross / (1 + start @ end))
 
 
 def up_axis_rotation(

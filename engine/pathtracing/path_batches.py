@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
+from octasplat.engine.core.rays import ImageRays
 from octasplat.engine.pathtracing.kernels.path_args import (
     BLOCK_SIZE,
     CameraRays,
@@ -77,8 +78,11 @@ def allocate_path_block() -> PathBlock:
     )  # fmt: skip
 
 
-def optical_axis(directions_world: Float32[np.ndarray, "h w 3"]) -> Float64[np.ndarray, "3"]:
-    """Return the direction through the image's centre."""
+def optical_axis(image: ImageRays) -> Float64[np.ndarray, "3"]:
+    """Return the axis of an image's camera; where that is not known the direction through its centre."""
+    if image.axis_world is not None:
+        return image.axis_world / np.linalg.norm(image.axis_world)
+    directions_world = image.directions_world
     height, width = directions_world.shape[:2]
     # the middle pixel, or the two or four around it
     middle = directions_world[(height - 1) // 2 : height // 2 + 1, (width - 1) // 2 : width // 2 + 1]

@@ -175,7 +175,7 @@ class PathTracer:
         view = CameraRays(
             image.origin_world.astype(np.float64),
             image.directions_world,
-            optical_axis(image.directions_world),
+            optical_axis(image),
             self._settings.aperture,
             self._settings.focus_distance or 1.0,
         )

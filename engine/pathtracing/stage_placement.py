@@ -10,8 +10,8 @@ from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.local_origin import NO_ORIGIN, Origin
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.pathtracing.compile_meshes import load_mesh_shape, mesh_up_axis
-from octasplat.engine.pathtracing.mesh_shapes import transform_points, up_axis_rotation
-from octasplat.engine.pathtracing.stage.model import RestingPlace, Stage
+from octasplat.engine.pathtracing.mesh_shapes import rotation_matrix, transform_points, up_axis_rotation
+from octasplat.engine.pathtracing.stage.model import RestingPlace, Stage, StageMesh
 from octasplat.engine.trace.protocol import Tracer
 
 Ray = tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]
@@ -39,16 +39,36 @@ def place_resting_meshes(
         if tracer is None:
             raise ConfigError(f"{key}: there are no Gaussians on which it could stand.")
         spot = _resting_point(mesh.on, tracer, ray_of_pixel, key)
-        shape = load_mesh_shape(mesh, number, folder, origin_world)
-        points = transform_points(
-            shape.vertices, mesh, up_axis_rotation(mesh_up_axis(mesh), mesh.turn_degrees, up)
-        ) - np.array(mesh.position)
-        heights = points @ up
-        middle = (points.min(axis=0) + points.max(axis=0)) / 2
+        vertices = load_mesh_shape(mesh, number, folder, origin_world).vertices
+        heights = _turned(vertices, mesh, mesh.turn_degrees, up) @ up
+        middle = _middle(vertices, mesh, up)
         foot = middle - (middle @ up - heights.min()) * up  # the lowest point under the middle
         position = spot - foot + np.array(mesh.position)
         meshes[number] = mesh.model_copy(update={"position": tuple(float(x) for x in position), "on": None})
     return stage.model_copy(update={"meshes": tuple(meshes)})
+
+
+def _turned(
+    vertices: Float64[np.ndarray, "v 3"], mesh: StageMesh, degrees: float, up: Float64[np.ndarray, "3"]
+) -> Float64[np.ndarray, "v 3"]:
+    """Return the vertices of a mesh about its position, where it is turned by some degrees."""
+    turn = up_axis_rotation(mesh_up_axis(mesh), degrees, up)
+    return transform_points(vertices, mesh, turn) - np.array(mesh.position)
+
+
+def _middle(
+    vertices: Float64[np.ndarray, "v 3"], mesh: StageMesh, up: Float64[np.ndarray, "3"]
+) -> Float64[np.ndarray, "3"]:
+    """Return what is the middle of a mesh before its turn, about its position.
+
+    The turn takes it along: boxes around what turns have other middles all the time, and it would sway.
+    """
+    points = _turned(vertices, mesh, 0.0, up)
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    if mesh.turn_degrees != 0.0:
+        tilt = rotation_matrix(mesh.rotation_degrees)
+        middle = tilt @ up_axis_rotation("world", mesh.turn_degrees, up) @ tilt.T @ middle
+    return np.asarray(middle)
 
 
 def _resting_point(

@@ -143,7 +143,8 @@ class PinholeCamera:
         directions_cam[..., 2] = 1.0
         directions_cam /= np.linalg.norm(directions_cam, axis=-1, keepdims=True)
         directions_world = directions_cam @ self.rotation_cam_from_world
-        return ImageRays.from_directions(self.centre_world, directions_world, self.near_world)
+        axis_world = self.rotation_cam_from_world[2]
+        return ImageRays.from_directions(self.centre_world, directions_world, self.near_world, axis_world)
 
     def project(self, points_world: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 2"]:
         """Return the pixel coordinates of points; NaN for those not in front of the camera."""

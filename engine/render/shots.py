@@ -244,4 +244,5 @@ def _view_rays(view: PosedView, camera: Camera, near_world: float) -> ImageRays:
         directions[np.isnan(directions).any(axis=1)] = (0.0, 0.0, 1.0)
         world = directions @ view.rotation_cam_from_world
         directions_world[top : top + rows] = world.reshape(-1, width, 3)
-    return ImageRays.from_directions(view.origin_world, directions_world, near_world)
+    axis_world = view.rotation_cam_from_world[2]
+    return ImageRays.from_directions(view.origin_world, directions_world, near_world, axis_world)

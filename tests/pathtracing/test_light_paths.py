@@ -8,7 +8,7 @@ import pytest
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.pathtracing.compile_meshes import check_outside_glass, compile_meshes
 from octasplat.engine.pathtracing.mesh_files import MeshShape
-from octasplat.engine.pathtracing.mesh_shapes import primitive_shape, turn_outwards
+from octasplat.engine.pathtracing.mesh_shapes import primitive_shape, rotation_matrix, turn_outwards
 from octasplat.engine.pathtracing.path_tracer import PathTracer, PathTracerScene
 from octasplat.engine.pathtracing.stage.materials import Dielectric, Diffuse, Glass, Metal, Mirror
 from octasplat.engine.pathtracing.stage.model import (
@@ -21,6 +21,7 @@ from octasplat.engine.pathtracing.stage.model import (
     StageMesh,
 )
 from octasplat.engine.render.image_files import write_exr
+from octasplat.engine.render.pinhole_camera import PinholeCamera
 from tests.support.light_scenes import camera, film_of, psnr
 
 AHEAD = camera((0, 0, -4), (0, 0, 0), (24, 16), 30)
@@ -195,6 +196,43 @@ def test_depth_of_field_blurs_out_of_focus_objects(tmp_path: Path) -> None:
     # Out of focus by half, a point at 4 is as wide as half the lens: 0.1 at 4, which are 11 pixels.
     assert edge_width(4.0) <= 1
     assert 6 <= edge_width(8.0 / 3.0) <= 14
+
+
+def test_plane_across_the_axis_is_in_focus_wherever_the_axis_meets_the_picture(tmp_path: Path) -> None:
+    slats = tuple(
+        StageMesh(
+            shape="cube", position=(x, 0, 4), scale=(0.05, 9, 0.001), material=Diffuse(color_srgb=WHITE)
+        )
+        for x in np.arange(0, 4, 0.2)
+    )
+    sun = DirectionalLight(direction=(0, 0, 1), irradiance=3.0)
+    view = PinholeCamera.from_pose(np.eye(4), 96, 8, fy_px=96, cx_px=0)
+
+    def row(**lens: float) -> np.ndarray:
+        numbers = Integrator(samples=64, max_depth=1, **lens)
+        stage = Stage(gaussians=(), meshes=slats, lights=(sun,), integrator=numbers)
+        return film_of(stage, view, tmp_path).image().rgb_linear[4, :, 0]
+
+    assert np.abs(row(aperture=0.5, focus_distance=4.0) - row()).mean() < 2e-3
+
+
+@pytest.mark.parametrize("half_side", [10.0, 1e3, 1e5])
+def test_large_sloping_ground_neither_shadows_nor_mirrors_itself(half_side: float, tmp_path: Path) -> None:
+    slope = (17.0, 0.0, 31.0)
+    up = rotation_matrix(slope) @ np.array([0.0, -1.0, 0.0])
+    x, y, z = up.tolist()
+    sun = DirectionalLight(direction=(-x, -y, -z), irradiance=np.pi)
+    sky = RectangleLight(
+        position=(3 * x, 3 * y, 3 * z), direction=(-x, -y, -z), width=99, height=99, radiance=1
+    )
+    eye = tuple((2 * up + (0.01, 0.02, -0.3)).tolist())
+    view = camera(eye, (0.3, 0, 0.2), (32, 24), 40)
+    for material, light in ((Diffuse(color_srgb=WHITE), sun), (Mirror(), sky)):
+        ground = StageMesh(shape="plane", scale=half_side, rotation_degrees=slope, material=material)
+        numbers = Integrator(samples=16, max_depth=2)
+        stage = Stage(gaussians=(), meshes=(ground,), lights=(light,), integrator=numbers)
+        seen = film_of(stage, view, tmp_path).image().rgb_linear
+        np.testing.assert_allclose(seen, 1.0, atol=1e-5)
 
 
 def test_light_of_a_point_goes_straight_through_a_pane(tmp_path: Path) -> None:

@@ -8,11 +8,24 @@ import pytest
 from scipy.stats import chi2
 
 from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.pathtracing.compile_meshes import compile_meshes
 from octasplat.engine.pathtracing.environment import EnvironmentMap, environment_frame
 from octasplat.engine.pathtracing.lights import build_light_arrays, eval_environment_map
-from octasplat.engine.pathtracing.stage.model import DirectionalLight, PointLight, RectangleLight, SpotLight
-from octasplat.engine.render.environment_files import read_environment, write_environment
+from octasplat.engine.pathtracing.stage.model import (
+    DirectionalLight,
+    Environment,
+    PointLight,
+    RectangleLight,
+    SpotLight,
+    Stage,
+)
+from octasplat.engine.render.environment_files import (
+    read_environment,
+    write_background_map,
+    write_environment,
+)
 from octasplat.engine.render.image_files import write_exr
+from octasplat.engine.shading.background import LearnedBackground
 from tests.support.light_samples import sample_lights
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -43,6 +56,17 @@ def test_parallel_rectangle_form_factor() -> None:
     )
     # Which side is the level one follows from the up direction that the stage names.
     np.testing.assert_allclose(irradiance(samples), 4 * corner * np.pi * 3.0, rtol=2e-3)
+
+
+@pytest.mark.parametrize("radius", [1e-30, 1e-200])
+def test_ball_as_small_as_it_likes_lights_as_a_point(radius: float) -> None:
+    point, ball = (PointLight(position=(0, 0, 0), intensity=3, radius=each) for each in (0.0, radius))
+    points = np.random.default_rng(0).normal(size=(16, 3))
+    wanted, found = (
+        sample_lights(build_light_arrays((lamp,), UP), points, stratified(4)) for lamp in (point, ball)
+    )
+    for one, other in zip(wanted, found, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_rectangle_light_back_side_is_black() -> None:
@@ -145,6 +169,16 @@ def test_environment_rotation_turns_map() -> None:
     assert eval_environment_map(level, np.array([[1.0, 0.0, 0.0]]))[0][0, 0] == 1.0
     turned = build_light_arrays((), UP, EnvironmentMap(radiance, environment_frame(UP, 90.0)))
     assert eval_environment_map(turned, np.array([[0.0, 1.0, 0.0]]))[0][0, 0] == pytest.approx(1.0)
+
+
+def test_background_of_a_run_lies_in_a_tilted_stage_as_it_was_learnt(tmp_path: Path) -> None:
+    learnt = LearnedBackground(16)
+    write_background_map(tmp_path / "background.exr", learnt.rgb_srgb)
+    tilted = (0.2, -0.9, 0.3)
+    for up, frame in (((0.0, -1.0, 0.0), learnt.frame), (None, environment_frame(np.array(tilted)))):
+        stage = Stage(up=tilted, environment=Environment(file="background.exr", up=up))
+        lights = compile_meshes(stage, tmp_path, threads=1).lights
+        np.testing.assert_allclose(lights.environment_frame, frame, atol=1e-12)
 
 
 def test_environment_invalid_image_is_refused(tmp_path: Path) -> None:

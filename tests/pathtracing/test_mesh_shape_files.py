@@ -114,7 +114,8 @@ def test_normals_of_a_clear_coat_are_told_unless_they_are_those_below(
 @pytest.mark.parametrize(
     ("node", "word"),
     [({"skin": 0}, "bones"), ({"weights": [0, 0.5]}, "morph targets"), ({"weights": [0, 0]}, None),
-     ({"extensions": {"EXT_mesh_gpu_instancing": {}}}, "Copies")],
+     ({"extensions": {"EXT_mesh_gpu_instancing": {}}}, "Copies"),
+     ({"extensions": {"KHR_lights_punctual": {"light": 0}}}, "lamps")],
 )  # fmt: skip
 def test_what_glb_nodes_say_in_vain_is_told(tmp_path: Path, node: dict[str, Any], word: str | None) -> None:
     write_glb(tmp_path / "a.glb", primitive_shape("plane"), [{}], node=node)
@@ -124,6 +125,19 @@ def test_what_glb_nodes_say_in_vain_is_told(tmp_path: Path, node: dict[str, Any]
         assert said == []
     else:
         assert len(said) == 1 and said[0].startswith("a.glb: ") and word in said[0]
+
+
+def test_image_that_a_ply_names_is_told_as_passed_over(tmp_path: Path) -> None:
+    rows = "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
+    for comments, count in (("comment TextureFile wood bark.png\n", 1), ("comment made by hand\n", 0)):
+        (tmp_path / "a.ply").write_text(
+            f"ply\nformat ascii 1.0\n{comments}element vertex 3\nproperty float x\nproperty float y\n"
+            f"property float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n{rows}"
+        )
+        said: list[str] = []
+        compile_meshes(Stage(meshes=(StageMesh(file="a.ply"),)), tmp_path, warn=said.append)
+        assert len(said) == count
+        assert all("wood bark.png is passed over" in sentence for sentence in said)
 
 
 def test_normal_texture_changes_shading_normal(tmp_path: Path) -> None:

@@ -3,14 +3,19 @@
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
 from octasplat.engine.core.errors import OctasplatError
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
+from octasplat.engine.pathtracing.mesh_shapes import transform_points, up_axis_rotation
 from octasplat.engine.pathtracing.stage.model import DirectionalLight, Stage
 from octasplat.engine.pathtracing.stage.stage_file import read_stage
 from octasplat.engine.pathtracing.stage_motion import stage_at
+from octasplat.engine.pathtracing.stage_placement import Ray, place_resting_meshes
+from octasplat.engine.trace.factory import make_tracer
+from octasplat.engine.trace.protocol import TraceSettings
 from octasplat.workers.cli.main import cli
 from tests.support.light_scenes import table_with_a_box
 
@@ -85,6 +90,38 @@ def test_values_rest_before_and_after_their_keys() -> None:
     for frame, x in ((0, 0.0), (2, 0.0), (3, 1.0), (6, 4.0), (100, 4.0)):
         [mesh] = stage_at(stage, frame).meshes
         assert mesh.position == (x, 0.0, 0.0) and mesh.turn_degrees == 30.0 and not mesh.keys
+
+
+@pytest.mark.parametrize("tilt", [(0.0, 0.0, 0.0), (0.0, 0.0, 20.0)])
+def test_what_turns_where_it_stands_does_not_sway(tilt: tuple[float, ...], tmp_path: Path) -> None:
+    # an L, whose box has another middle at each turn
+    corners = [(0, 0, 0), (1, 0, 0), (1, 0, 0.2), (0.2, 0, 0.2), (0.2, 0, 1), (0, 0, 1), (0, -0.2, 0)]
+    text = "".join(f"v {x} {y} {z}\n" for x, y, z in corners)
+    (tmp_path / "l.obj").write_text(text + "f 1 2 3\nf 1 3 4\nf 1 4 5\nf 1 5 6\nf 1 7 2\n")
+    tracer = make_tracer(TraceSettings(), threads=1)
+    tracer.build(table_with_a_box())
+    keys = [{"frame": 0, "turn_degrees": 0}, {"frame": 8, "turn_degrees": 360}]
+    on = {"origin": (0.5, -2, 0.5), "direction": (0, 1, 0)}
+    stage = Stage.model_validate(
+        {"meshes": [{"file": "l.obj", "scale": 0.3, "rotation_degrees": tilt, "on": on, "keys": keys}]}
+    )
+    middles, heights = [], []
+    for frame in range(9):
+        [mesh] = place_resting_meshes(stage_at(stage, frame), tracer, _no_photographs, tmp_path).meshes
+        turn = up_axis_rotation("world", mesh.turn_degrees, np.array([0.0, -1.0, 0.0]))
+        placed = transform_points(np.array(corners, np.float64), mesh, turn)
+        middle = transform_points(np.array([[0.5, -0.1, 0.5]]), mesh, turn)[0]
+        middles.append(middle[[0, 2]])
+        heights.append(placed[:, 1].max())
+    if not any(tilt):
+        np.testing.assert_allclose(middles, 0.5, atol=1e-9)
+    assert np.ptp(middles, axis=0).max() < 0.02
+    # it stands on the table all the time
+    np.testing.assert_allclose(heights, heights[0], atol=1e-9)
+
+
+def _no_photographs(name: str, _pixel: tuple[float, float]) -> Ray:
+    raise AssertionError(name)
 
 
 @pytest.mark.parametrize("degrees", [0.0, 10.0, 90.0, 170.0])

@@ -15,7 +15,7 @@ from octasplat.engine.pathtracing.kernels.scatter_vectors import (
     write_lamp_samples8,
 )
 from octasplat.engine.pathtracing.kernels.surface import offset_ray_origin
-from octasplat.engine.pathtracing.kernels.surface_point_vectors import SURFACE_POINT_ROWS
+from octasplat.engine.pathtracing.kernels.surface_point_vectors import RAY_STEP_ROW, SURFACE_POINT_ROWS
 from octasplat.engine.pathtracing.stage.model import RectangleLight, Stage
 
 COUNT = 64
@@ -58,7 +58,9 @@ def test_samples_of_a_lamp_are_those_of_one_row() -> None:
     points, numbers = surface_points(), np.random.default_rng(1).random((3, COUNT))
     out = np.empty((LAMP_SAMPLE_ROWS, COUNT))
     lamp_rows(points, numbers[1:], lights, out)
-    origins = np.array([offset_ray_origin.py_func(*points[:6, n]) for n in range(COUNT)])
+    origins = np.array(
+        [offset_ray_origin.py_func(*points[:6, n], points[RAY_STEP_ROW, n]) for n in range(COUNT)]
+    )
     np.testing.assert_allclose(out[:3].T, origins, rtol=1e-13)
     directions, radiance = np.empty((2, COUNT, 3))
     distances, density = np.empty((2, COUNT))

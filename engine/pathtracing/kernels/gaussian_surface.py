@@ -153,7 +153,7 @@ def intersect_gaussian_surfaces(
         if scene.any_nested:
             copy_media(paths.media[p], shadows.media[k])
         light = draw_light(lights, point, samples)
-        surface = SurfacePoint(point, normal, normal)
+        surface = SurfacePoint(point, normal, normal, 0.0)
         scatter_path(p, samples, paths, False, surface, bsdf, tables, light, query)
 
 
@@ -193,5 +193,5 @@ def start_paths_at_surfaces(
         bsdf = Bsdf(color, float(material[3]), float(material[4]), IOR, BURLEY, False, 0.0, 0.0)
         query = LightQuery(lights, integrator, shadows, k)
         light = draw_light(lights, origin, column)
-        surface = SurfacePoint(origin, normal, normal)
+        surface = SurfacePoint(origin, normal, normal, 0.0)
         scatter_path(k, column, paths, False, surface, bsdf, tables, light, query)

@@ -88,7 +88,7 @@ def _enter_far_side(paths: PathArrays, p: int, glass: Glass) -> None:
 @njit_no_refcount(forceinline=True)
 def scatter_mirror(paths: PathArrays, p: int, point: SurfacePoint, reflectance: Rgb) -> None:
     """Reflect a path at a mirror and multiply its throughput by ``reflectance``."""
-    (x, y, z), (n_x, n_y, n_z), (s_x, s_y, s_z) = point
+    (x, y, z), (n_x, n_y, n_z), (s_x, s_y, s_z), step = point
     red, green, blue = reflectance
     d = paths.directions_world[p]
     r_x, r_y, r_z = reflect(d[0], d[1], d[2], s_x, s_y, s_z)
@@ -99,7 +99,7 @@ def scatter_mirror(paths: PathArrays, p: int, point: SurfacePoint, reflectance: 
     paths.throughput[p, 0] *= red
     paths.throughput[p, 1] *= green
     paths.throughput[p, 2] *= blue
-    x, y, z = offset_ray_origin(x, y, z, n_x, n_y, n_z)
+    x, y, z = offset_ray_origin(x, y, z, n_x, n_y, n_z, step)
     spawn_ray(paths, p, x, y, z, r_x, r_y, r_z, 0.0)
 
 
@@ -112,7 +112,7 @@ def scatter_smooth_glass(
     choice: float,
 ) -> None:
     """Reflect a path at glass or let it through, by chance as Fresnel says."""
-    (x, y, z), (n_x, n_y, n_z), (s_x, s_y, s_z) = point
+    (x, y, z), (n_x, n_y, n_z), (s_x, s_y, s_z), step = point
     d = paths.directions_world[p]
     materials, m, eta = glass.materials, glass.m, glass.eta
     cosine = -(d[0] * s_x + d[1] * s_y + d[2] * s_z)
@@ -138,7 +138,7 @@ def scatter_smooth_glass(
     if paths.pdf[p] > 0.0:
         paths.flags[p] |= FLAG_THROUGH_GLASS
     _enter_far_side(paths, p, glass)
-    x, y, z = offset_ray_origin(x, y, z, -n_x, -n_y, -n_z)
+    x, y, z = offset_ray_origin(x, y, z, -n_x, -n_y, -n_z, step)
     spawn_ray(paths, p, x, y, z, t_x, t_y, t_z, 0.0)
 
 
@@ -163,7 +163,7 @@ def scatter_rough_glass(
     query: LightQuery,
 ) -> None:
     """Queue a light query at rough glass, and reflect or refract the path at a microfacet."""
-    (x, y, z), (n_x, n_y, n_z), (s_x, s_y, s_z) = point
+    (x, y, z), (n_x, n_y, n_z), (s_x, s_y, s_z), step = point
     lights, shadows, k = query.lights, query.shadows, query.k
     d = paths.directions_world[p]
     materials, m, eta = glass.materials, glass.m, glass.eta
@@ -175,8 +175,8 @@ def scatter_rough_glass(
     o_y = -(d[0] * b_x + d[1] * b_y + d[2] * b_z)
     o_z = -(d[0] * s_x + d[1] * s_y + d[2] * s_z)
     gain = _rough_glass_gain(glass, o_z)
-    front = offset_ray_origin(x, y, z, n_x, n_y, n_z)
-    back = offset_ray_origin(x, y, z, -n_x, -n_y, -n_z)
+    front = offset_ray_origin(x, y, z, n_x, n_y, n_z, step)
+    back = offset_ray_origin(x, y, z, -n_x, -n_y, -n_z, step)
     # --- a sample of a light ---
     w = paths.throughput[p]
     # directly seen light is not cut off

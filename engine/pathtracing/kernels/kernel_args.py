@@ -67,7 +67,8 @@ class MaterialArrays(NamedTuple):
         coat_albedo: tables of dielectrics' surfaces.
         coat_mean_albedo: their means.
         texels_linear: all textures' values, one texture after another.
-        texture_sizes: first texel, height and width of each.
+        texture_sizes: of each first texel, height and width, how it goes on beyond its edges, across and
+            down, as places in :data:`.texture.WRAP_MODES`, and 1 where its pixels are blocks, else 0.
     """
 
     kinds: Int32[np.ndarray, " m"]
@@ -98,7 +99,7 @@ class MaterialArrays(NamedTuple):
     coat_albedo: Float64[np.ndarray, "t a c"]
     coat_mean_albedo: Float64[np.ndarray, "t a 2"]
     texels_linear: Float32[np.ndarray, "x 3"]
-    texture_sizes: Int64[np.ndarray, "k 3"]
+    texture_sizes: Int64[np.ndarray, "k 6"]
 
 
 class LightArrays(NamedTuple):
@@ -131,7 +132,8 @@ class LightArrays(NamedTuple):
         mesh_uv: likewise.
         mesh_alpha: likewise, factor of the opacity at the corners.
         texels_linear: see :class:`MaterialArrays`, as the next one.
-        texture_sizes: first texel, height and width of each.
+        texture_sizes: of each first texel, height and width, how it goes on beyond its edges, across and
+            down, as places in :data:`.texture.WRAP_MODES`, and 1 where its pixels are blocks, else 0.
         environment_linear: the map, one black pixel without one.
         environment_row_cdf: see :class:`octasplat.engine.pathtracing.environment.EnvironmentSampler`, as
             the next two.
@@ -166,7 +168,7 @@ class LightArrays(NamedTuple):
     mesh_uv: Float32[np.ndarray, "f 3 2"]
     mesh_alpha: Float32[np.ndarray, "f 3"]
     texels_linear: Float32[np.ndarray, "x 3"]
-    texture_sizes: Int64[np.ndarray, "k 3"]
+    texture_sizes: Int64[np.ndarray, "k 6"]
     environment_linear: Float32[np.ndarray, "h w 3"]
     environment_row_cdf: Float64[np.ndarray, " h1"]
     environment_column_cdf: Float64[np.ndarray, "h w1"]
@@ -238,11 +240,15 @@ class Bsdf(NamedTuple):
 
 
 class SurfacePoint(NamedTuple):
-    """A point of a surface, its normal on the viewer's side, and the one that it is shaded by."""
+    """A point of a surface, its normal on the viewer's side, and the one that it is shaded by.
+
+    Rays that go on begin ``ray_step`` off the surface; it is 0 where the point is off it already.
+    """
 
     position: Vec3
     normal: Vec3
     shading_normal: Vec3
+    ray_step: float
 
 
 class AlbedoTables(NamedTuple):

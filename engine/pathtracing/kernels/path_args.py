@@ -206,7 +206,7 @@ class PathScratch(NamedTuple):
     distances: Float32[np.ndarray, " b"]
     faces: Int32[np.ndarray, " b"]
     barycentrics: Float32[np.ndarray, "b 2"]
-    surface_points: Float64[np.ndarray, "22 s"]
+    surface_points: Float64[np.ndarray, "23 s"]
 
 
 class CameraRays(NamedTuple):

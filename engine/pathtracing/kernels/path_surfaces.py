@@ -62,7 +62,7 @@ from octasplat.engine.pathtracing.kernels.surface import (
     interpolate_uv,
     offset_ray_origin,
 )
-from octasplat.engine.pathtracing.kernels.surface_point_vectors import write_surface_points8
+from octasplat.engine.pathtracing.kernels.surface_point_vectors import RAY_STEP_ROW, write_surface_points8
 from octasplat.engine.pathtracing.kernels.surface_samples import (
     any_rough_glass,
     fill_samples,
@@ -111,7 +111,7 @@ def _scatter_at_material(
     point: SurfacePoint,
     is_guide: bool,
     samples: PathSamples,
-    at: Float64[np.ndarray, "22 s"],
+    at: Float64[np.ndarray, "23 s"],
     query: LightQuery,
 ) -> None:
     """Scatter a path by the material of a face, with a light query where the material scatters.
@@ -142,14 +142,14 @@ def _scatter_at_material(
         return
     d = paths.directions_world[p]
     (x, y, z), (n_x, n_y, n_z) = point.position, point.normal
-    origin = offset_ray_origin(x, y, z, n_x, n_y, n_z)
+    origin = offset_ray_origin(x, y, z, n_x, n_y, n_z, point.ray_step)
     s_x, s_y, s_z = eval_normal_map(
         materials, m, surfaces.corners_world[face], uv, (u_t, v_t), point.normal, point.shading_normal,
         (float(d[0]), float(d[1]), float(d[2])),
     )  # fmt: skip
     if is_guide:
         _write_denoiser_guides(paths, p, (red, green, blue), (s_x, s_y, s_z))
-    off_surface = SurfacePoint(origin, point.normal, (s_x, s_y, s_z))
+    off_surface = SurfacePoint(origin, point.normal, (s_x, s_y, s_z), 0.0)
     light = light_of_row(query.lights, origin, samples, at)
     if kind == DIFFUSE and materials.normal_textures[m] < 0:
         n = samples.n
@@ -239,7 +239,7 @@ def _shade_hit(scratch: PathScratch, bounce: Bounce, kind: int, k: int, place: i
     shadows.medium_ids[k] = paths.medium_ids[p]
     if scene.any_nested:
         copy_media(paths.media[p], shadows.media[k])
-    point = SurfacePoint(position, normal, shading_normal)
+    point = SurfacePoint(position, normal, shading_normal, at[RAY_STEP_ROW, place])
     _scatter_at_material(
         paths, p, scene, face, kind, (a, b, c), facing >= 0.0, point, is_guide, samples, at, query
     )  # fmt: skip

@@ -256,7 +256,7 @@ def scatter_path(
 
     A surface that ``is_diffuse`` has a color alone.
     """
-    (x, y, z), _, (s_x, s_y, s_z) = point
+    (x, y, z), _, (s_x, s_y, s_z), _ = point
     d = paths.directions_world[p]
     # --- the direction to the viewer, in the frame of the shading normal ---
     a_x, a_y, a_z, b_x, b_y, b_z = orthonormal_basis(s_x, s_y, s_z)

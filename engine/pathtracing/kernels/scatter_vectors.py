@@ -13,7 +13,7 @@ from numba.core.typing import Context as TypingContext
 from numba.core.typing.templates import Signature
 from numba.extending import intrinsic
 
-from octasplat.engine.pathtracing.kernels.surface import RAY_OFFSET_SCALE
+from octasplat.engine.pathtracing.kernels.surface_point_vectors import RAY_STEP_ROW
 from octasplat.engine.trace.cpu.kernels.simd_ops import DOUBLE, INT8
 from octasplat.engine.trace.cpu.kernels.simd_vector import DOUBLE8, I64, LANES, Vector, VectorRows, broadcast
 from octasplat.engine.trace.kernels.native import Address, Intrinsic
@@ -72,7 +72,7 @@ def write_lamp_samples8(
         position, side_u, side_v, axis = (_numbers(builder, args[place], 3) for place in (4, 5, 6, 7))
         place, normal = [rows[j] for j in range(3)], [rows[3 + j] for j in range(3)]
         # --- off the surface ---
-        step = abs(place[0]).maximum(abs(place[1])).maximum(abs(place[2])).maximum(1e-3) * RAY_OFFSET_SCALE
+        step = rows[RAY_STEP_ROW]
         place = [x + step * n for x, n in zip(place, normal, strict=True)]
         # --- to a place on the lamp ---
         way = [position[j] - place[j] + (u * side_u[j] + v * side_v[j]) for j in range(3)]

@@ -12,13 +12,23 @@ from numba.core.typing import Context as TypingContext
 from numba.core.typing.templates import Signature
 from numba.extending import intrinsic
 
+from octasplat.engine.pathtracing.kernels.surface import FACE_OFFSET_SCALE, RAY_OFFSET_SCALE
 from octasplat.engine.trace.cpu.kernels.simd_ops import INT8, LONG8, gather, load, store
 from octasplat.engine.trace.cpu.kernels.simd_vector import DOUBLE8, FLOAT8, LANES, Vector
 from octasplat.engine.trace.kernels.native import Address, Intrinsic
 
-SURFACE_POINT_ROWS = 10
-"""Rows of a block of surface points: place, normal, shading normal, cosine to the viewer."""
+SURFACE_POINT_ROWS = 11
+"""Rows of a block of surface points: place, normal, shading normal, cosine to the viewer, and how far off the
+surface rays begin."""
+RAY_STEP_ROW = 10
 _VectorXyz = list[Vector]
+
+
+def _largest(values: _VectorXyz) -> Vector:
+    largest = abs(values[0])
+    for value in values[1:]:
+        largest = largest.maximum(abs(value))
+    return largest
 
 
 def _dot(a: _VectorXyz, b: _VectorXyz) -> Vector:
@@ -91,7 +101,10 @@ def write_surface_points8(
         s = [is_below.select(x * -1.0, x) for x in s]
         is_hidden = _dot(s, d) > -1e-4
         s = [is_hidden.select(x, y) for x, y in zip(n, s, strict=True)]
-        for j, value in enumerate([*place, *n, *s, facing]):
+        # --- how far off the surface rays begin ---
+        step = _largest(place).maximum(1e-3) * RAY_OFFSET_SCALE
+        step = step.maximum(_largest([x for edge in edges for x in edge]) * FACE_OFFSET_SCALE)
+        for j, value in enumerate([*place, *n, *s, facing, step]):
             address = builder.add(args[7], builder.mul(args[8], ir.Constant(args[8].type, j)))
             store(builder, value.value, address)
         return context.get_dummy_value()

@@ -143,7 +143,7 @@ def write_scatter_samples(scratch: PathScratch, lights: LightArrays, kind: int, 
 
 @njit_no_refcount(forceinline=True, fastmath={"contract"})
 def light_of_row(
-    lights: LightArrays, origin: Vec3, samples: PathSamples, at: Float64[np.ndarray, "22 s"]
+    lights: LightArrays, origin: Vec3, samples: PathSamples, at: Float64[np.ndarray, "23 s"]
 ) -> LightSample:
     """Return the sample of a light for a point, the only lamp's from its row."""
     if not is_only_rectangle(lights):

@@ -69,12 +69,15 @@ def trace_paths(
             bounce = Bounce(paths, active, depth, hits, scene, integrator, shadows)
             if queries.any_cutout or scene.any_nested:
                 pass_surfaces(0, left, scratch, queries, bounce)
+            any_enters = False
             if len(boxes.all) > 0:
-                end_paths_in_boxes(boxes.all, bounce, left, each, enters)
+                any_enters = end_paths_in_boxes(boxes.all, bounce, left, each, enters)
             # --- surfaces, and light that reaches them ---
             shade_surfaces(0, left, scratch, bounce)
-            if len(boxes.casting_shadows) > 0:
-                mark_shadows_in_boxes(boxes.casting_shadows, bounce, left, each, enters)
+            if len(boxes.casting_shadows) > 0 and mark_shadows_in_boxes(
+                boxes.casting_shadows, bounce, left, each, enters
+            ):
+                any_enters = True
             shadow_transmittance(
                 0, left, scratch, queries, scene.surfaces, scene.materials, shadows, False, transmittance
             )
@@ -85,7 +88,7 @@ def trace_paths(
                 # no branch: which path ends is not to be foreseen
                 active[np.uintp(going)] = active[np.uintp(k)]
                 going += paths.is_alive[np.uintp(active[np.uintp(k)])]
-            if len(boxes.all) > 0:
+            if any_enters:
                 left, going = going, 0
                 for k in range(left):
                     active[going] = active[k]

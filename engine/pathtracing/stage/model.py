@@ -220,16 +220,24 @@ class Environment(StageModel):
     """Distant light from all directions.
 
     Attributes:
-        file: equirectangular HDR or EXR image of linear radiance, the stage's up at its top.
-        rotation_degrees: turns the image about the stage's up.
+        file: equirectangular HDR or EXR image of linear radiance.
+        up: the direction in the world that is at its top; by default the stage's up.
+        rotation_degrees: turns the image about its up.
         strength: factor.
         visible: whether the camera sees it; otherwise it only lights, and shows in mirrors and glass.
     """
 
     file: str
+    up: Vector | None = None
     rotation_degrees: Finite = 0.0
     strength: NonNegative = 1.0
     visible: bool = True
+
+    @model_validator(mode="after")
+    def _check_up(self) -> "Environment":
+        if self.up is not None and not math.hypot(*self.up) > 1e-6:
+            raise ValueError("up has no length")
+        return self
 
 
 class StageGaussians(Transformed):

@@ -259,6 +259,7 @@ irradiance = 2.0                 # on what faces it; of 3.14 a matt white thing 
 
 # [environment]
 # file = "studio.hdr"
+# up = {up}   # at its top; of background.exr of a run [0, -1, 0], of environment.exr its materials.up_world
 # rotation_degrees = 0.0         # about up, anticlockwise seen from above
 # strength = 1.0
 # visible = false                # the camera sees the scene's own background; left out: true
