@@ -36,6 +36,7 @@ from octasplat.engine.runs.run_folder import (
     ENVIRONMENT_EXR,
     ENVIRONMENT_HDR,
     PLAN,
+    RESIDUAL,
     RESIDUAL_ITERATIONS,
     SCENE,
     TRAINING,
@@ -43,6 +44,8 @@ from octasplat.engine.runs.run_folder import (
 from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.shading.recipes import material_shading
+from octasplat.engine.shading.residual_colors import ResidualColors, with_residual
+from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.train.config import TrainConfig, iteration_count, residual_iteration_count
 from octasplat.engine.train.initialization.initial_gaussians import initial_train_state
 from octasplat.engine.train.loop.checkpoint import (
@@ -55,7 +58,12 @@ from octasplat.engine.train.loop.state import MinScale, TrainState
 from octasplat.engine.train.loop.time_budget import make_plan, read_plan, write_plan
 from octasplat.engine.train.loop.trainer import Trainer
 from octasplat.engine.train.sampling.pixel_sampler import valid_pixel_fraction
-from octasplat.engine.train.shading_factory import find_background, find_deferred, find_exposures
+from octasplat.engine.train.shading_factory import (
+    add_residual,
+    find_background,
+    find_deferred,
+    find_exposures,
+)
 from octasplat.engine.train.views.exposure_changes import resolve_exposure
 
 MIN_REFLECTIVE_SHARE = 0.01
@@ -130,6 +138,7 @@ def _fit_residual(run: ReconstructionRun, trainer: Trainer, gaussians: FlatGauss
     """Fit and write residual colors where a training with materials asks for them; return the iterations."""
     config, done = trainer.config, trainer.state.iteration
     if not (iterations := residual_iteration_count(config, done)):
+        (run.output / RESIDUAL).unlink(missing_ok=True)  # of a training that was begun anew
         return 0
     run.progress(Noted(f"Fitting residual colors, {iterations:,} iterations with all else kept."))
     residual_sh = fit_residual_colors(
@@ -138,6 +147,12 @@ def _fit_residual(run: ReconstructionRun, trainer: Trainer, gaussians: FlatGauss
         should_stop=run.should_stop,
     )  # fmt: skip
     write_residual(run.output, residual_sh)
+    materials = find_deferred(trainer.shading)
+    assert materials is not None, "materials are learnt"
+    tracer = make_tracer(config.trace, threads=run.threads)
+    tracer.build(with_residual(gaussians, residual_sh))
+    residual = ResidualColors(materials, tracer, residual_sh)
+    trainer.measure_views_again(add_residual(trainer.shading, residual))
     return iterations
 
 

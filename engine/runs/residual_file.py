@@ -11,6 +11,9 @@ from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.runs.run_folder import RESIDUAL
 from octasplat.engine.train.loop.checkpoint import ARCHIVE_DAMAGE
 
+COEFFICIENT_COUNTS = (1, 4, 9, 16)
+"""Coefficients of harmonics of degree 0 to 3."""
+
 
 def write_residual(output: Path, residual_sh: Float32[np.ndarray, "n k 3"]) -> None:
     """Write the harmonics of the residual color of each Gaussian of a run, atomically."""
@@ -40,10 +43,15 @@ def read_residual(output: Path, gaussians: FlatGaussians) -> Float32[np.ndarray,
             f"{path} cannot be read ({type(error).__name__}); delete it to show the run without residual "
             "colors."
         ) from None
-    is_harmonics = found.dtype == np.float32 and found.ndim == 3 and found.shape[2] == 3
+    is_harmonics = (
+        found.dtype == np.float32
+        and found.ndim == 3
+        and found.shape[1] in COEFFICIENT_COUNTS
+        and found.shape[2] == 3
+    )
     if not is_harmonics or len(found) != len(gaussians) or not np.isfinite(found).all():
         raise ConfigError(
             f"{path} does not belong to the scene beside it; delete it to show the run without residual "
             "colors."
         )
-    return found
+    return np.ascontiguousarray(found)  # kernels take rows one after the other

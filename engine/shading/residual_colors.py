@@ -33,6 +33,10 @@ from octasplat.engine.trace.protocol import Tracer, TraceResult
 ZERO_SRGB = np.float32(0.5)
 """Color that harmonics of zero have: the residual of a ray is what it shows less that."""
 
+WHITE_FADE_SRGB = np.float32(0.02)
+"""Residual colors below 0 by so much and more leave no radiance above white, less of them a part: the fit
+sees white there, so that what it takes off would not be seen."""
+
 
 def with_residual(gaussians: FlatGaussians, residual_sh: Float32[np.ndarray, "n k 3"]) -> FlatGaussians:
     """Return Gaussians that show residual colors, in front of :data:`ZERO_SRGB`.
@@ -81,7 +85,7 @@ class ResidualColors(WrapperModel):
         residual = residual_of(result)
         straight = residual / np.maximum(result.alpha, np.float32(1e-6))[:, None]
         return replace(
-            shaded, rgb_srgb=shaded.rgb_srgb + residual, layers=_with_residual_layers(shaded.layers, straight)
+            shaded, rgb_srgb=shaded.rgb_srgb + residual, layers=with_residual_layers(shaded.layers, straight)
         )
 
     def backward(self, traced: TracedRays, shaded: ShadedRays, grad: ShadedRayGradients) -> ShadingGradients:
@@ -89,14 +93,15 @@ class ResidualColors(WrapperModel):
         return self.inner.backward(traced, shaded, grad)
 
 
-def _with_residual_layers(
+def with_residual_layers(
     layers: Mapping[str, Float32[np.ndarray, "r _"]], residual_srgb: Float32[np.ndarray, "r 3"]
 ) -> Mapping[str, Float32[np.ndarray, "r _"]]:
     """Return the layers of a picture, whose radiance changes as what is shown of it does."""
     if LINEAR not in layers:
         return layers
     radiance = layers[LINEAR]
-    shown = linear_to_srgb(np.minimum(radiance, np.float32(1)))
-    # what is brighter than white stays so
-    change = srgb_to_linear(np.clip(shown + residual_srgb, 0, 1)) - np.minimum(radiance, np.float32(1))
-    return {**layers, LINEAR: np.asarray(radiance + change, np.float32)}
+    white = np.minimum(radiance, np.float32(1))
+    changed = srgb_to_linear(np.clip(linear_to_srgb(white) + residual_srgb, 0, 1))
+    # what is brighter than white stays so, unless the photographs show less than white there
+    kept = np.clip(1 + residual_srgb / WHITE_FADE_SRGB, 0, 1)
+    return {**layers, LINEAR: np.asarray(changed + kept * (radiance - white), np.float32)}

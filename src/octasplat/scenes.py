@@ -68,7 +68,7 @@ class Scene:
         self.materials = materials
         self.trained_with = trained_with
         self.viewpoints = viewpoints
-        self.residual_sh = residual_sh
+        self._residual_sh = residual_sh
 
     @classmethod
     def from_arrays(
@@ -193,6 +193,20 @@ class Scene:
             self.gaussians.sh[...] = coefficients
         else:  # of another degree
             self.gaussians.sh = np.array(coefficients, np.float32)
+
+    @property
+    def residual_sh(self) -> Float32[np.ndarray, "n k 3"] | None:
+        """Harmonics of what materials in the learnt light do not explain; None leaves them out."""
+        return self._residual_sh
+
+    @residual_sh.setter
+    def residual_sh(self, values: Float[np.ndarray, "n k 3"] | None) -> None:
+        if values is None:
+            self._residual_sh = None
+            return
+        coefficients = _as_numpy(values)
+        _check_sh(coefficients, len(self), "residual_sh")
+        self._residual_sh = np.array(coefficients, np.float32, order="C")
 
     @property
     def sh_degree(self) -> int:
@@ -336,13 +350,13 @@ def _put(name: str, rows: Float32[np.ndarray, "..."], values: Float[np.ndarray, 
     rows[...] = _rows(name, values, rows.shape)
 
 
-def _check_sh(values: Float[np.ndarray, "..."], count: int) -> None:
+def _check_sh(values: Float[np.ndarray, "..."], count: int, name: str = "sh") -> None:
     """Refuse what are no coefficients of so many Gaussians."""
     shape = values.shape
     if len(shape) != 3 or shape[0] != count or shape[1] not in (1, 4, 9, 16) or shape[2] != 3:
-        raise ConfigError(f"sh: has the shape {shape}; it must be ({count}, k, 3) with k 1, 4, 9 or 16.")
+        raise ConfigError(f"{name}: has the shape {shape}; it must be ({count}, k, 3) with k 1, 4, 9 or 16.")
     if not np.isfinite(values).all():
-        raise ConfigError("sh: must be finite.")
+        raise ConfigError(f"{name}: must be finite.")
 
 
 def _log_scales(scales: Float[np.ndarray, "..."]) -> Float64[np.ndarray, "..."]:

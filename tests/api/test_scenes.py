@@ -238,3 +238,24 @@ def test_what_is_no_path_is_not_loaded(scene_file: Path) -> None:
     scene = osp.load(scene_file)
     with pytest.raises(TypeError, match=r"load takes the path of a file or run, not Scene\("):
         osp.load(scene)  # type: ignore[arg-type]
+
+
+def test_residual_colors_are_taken_as_the_kernels_need_them() -> None:
+    """Any array of numbers means its values; what is none is refused where it is given."""
+    scene = osp.Scene.from_arrays(
+        means=np.zeros((3, 3)),
+        quats=np.tile([1.0, 0, 0, 0], (3, 1)),
+        scales=np.ones((3, 2)),
+        opacities=np.full(3, 0.5),
+        sh=np.zeros((3, 1, 3)),
+    )
+    given = np.arange(36.0).reshape(3, 4, 3)
+    scene.residual_sh = np.asfortranarray(given)
+    assert scene.residual_sh is not None
+    assert scene.residual_sh.dtype == np.float32 and scene.residual_sh.flags.c_contiguous
+    np.testing.assert_array_equal(scene.select([2]).residual_sh, given[2:])
+    for wrong in (given[:2], given[:, :2], given[:, :, :1], given[:, 0], np.full_like(given, np.nan)):
+        with pytest.raises(osp.ConfigError, match="residual_sh"):
+            scene.residual_sh = wrong
+    scene.residual_sh = None
+    assert scene.copy().residual_sh is None

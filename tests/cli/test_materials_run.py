@@ -240,3 +240,19 @@ def test_cameras_of_other_photographs_change_no_shading(materials_run, octasplat
             assert result.exit_code == 0, result.output
             found.append(output.read_bytes())
         assert found[0] == found[1], verb
+
+
+@pytest.mark.exhaustive
+def test_training_views_are_measured_with_residual_colors(materials_run, scene, octasplat, tiny, tmp_path):
+    """As held-out views are, beside which the report puts them."""
+    without = tmp_path / "without"
+    given = ("--set", "materials.residual_share=0")
+    result = octasplat("reconstruct", scene, "-o", without, *tiny, *MATERIALS, *given)
+    assert result.exit_code == 0, result.output
+    assert (without / "scene.ply").read_bytes() == (materials_run / "scene.ply").read_bytes()
+    assert not (without / "residual.npz").exists()
+    shown, plain = (
+        json.loads((run / "training.json").read_text())["training_views"] for run in (materials_run, without)
+    )
+    assert shown["psnr"] > plain["psnr"] + 0.1
+    assert shown["misfits"] == plain["misfits"]

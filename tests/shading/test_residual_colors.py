@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from octasplat.engine.core.color import linear_to_srgb, srgb_to_linear
 from octasplat.engine.core.rays import RayBatch
@@ -10,7 +11,7 @@ from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
 from octasplat.engine.shading.exposure import ExposureModel
 from octasplat.engine.shading.plain import PlainShading
 from octasplat.engine.shading.protocol import LINEAR, ShadedRays, TracedRays
-from octasplat.engine.shading.residual_colors import ResidualColors, with_residual
+from octasplat.engine.shading.residual_colors import ResidualColors, with_residual, with_residual_layers
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.train.shading_factory import add_residual, find_residual
 
@@ -84,3 +85,20 @@ def test_residual_lies_below_the_exposures() -> None:
     assert find_residual(model) is not None and find_residual(exposures) is None
     seen = replace(traced, view=np.zeros(len(traced.rays), np.int64))
     np.testing.assert_allclose(model.shade(seen).rgb_srgb, 0.5 * model.shade(traced).rgb_srgb, rtol=1e-5)
+
+
+@pytest.mark.parametrize("radiance", [1.0, 1.3, 3.0])
+@pytest.mark.parametrize("wanting", [-0.05, -0.3])
+def test_residual_darkens_what_is_brighter_than_white_as_it_was_fitted(
+    radiance: float, wanting: float
+) -> None:
+    """The fit sees white there, as a photograph does, and what it takes off."""
+    layers = {LINEAR: np.full((1, 3), radiance, np.float32)}
+    after = with_residual_layers(layers, np.full((1, 3), wanting, np.float32))[LINEAR]
+    np.testing.assert_allclose(linear_to_srgb(np.minimum(after, 1)), 1 + wanting, atol=1e-5)
+
+
+def test_radiance_above_white_has_no_steps() -> None:
+    wanting = np.linspace(-0.05, 0.01, 601, dtype=np.float32)[:, None].repeat(3, axis=1)
+    found = with_residual_layers({LINEAR: np.full((601, 3), 3, np.float32)}, wanting)[LINEAR]
+    assert np.abs(np.diff(found, axis=0)).max() < 0.02 and found[-1, 0] == 3

@@ -251,6 +251,15 @@ class Trainer:
             self._progress(Warned(self.poses.summary()))
         return gaussians
 
+    def measure_views_again(self, shading: ShadingModel) -> None:
+        """Measure once more how well the exported Gaussians show the views, by what was added to the shading.
+
+        Views that do not fit stay those that were told at the end of the training.
+        """
+        assert self.views is not None, "the training has ended"
+        tracer, left_out = self._components.tracer, self.state.excluded_views
+        self.views = replace(self.views, psnr=self._outlier_detector.report(tracer, shading, left_out).psnr)
+
     def _uses_rng_or_stops(self, done: int) -> bool:
         """Return whether anything but a batch uses the generator, or keeps its state, after an iteration."""
         schedule = self.schedule
