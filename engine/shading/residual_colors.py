@@ -33,9 +33,9 @@ from octasplat.engine.trace.protocol import Tracer, TraceResult
 ZERO_SRGB = np.float32(0.5)
 """Color that harmonics of zero have: the residual of a ray is what it shows less that."""
 
-WHITE_FADE_SRGB = np.float32(0.02)
+WHITE_FADE_SRGB = np.float32(0.3)
 """Residual colors below 0 by so much and more leave no radiance above white, less of them a part: the fit
-sees white there, so that what it takes off would not be seen."""
+sees white there, so that what it takes off would not be seen. Small ones are noise, and lamps stay bright."""
 
 
 def with_residual(gaussians: FlatGaussians, residual_sh: Float32[np.ndarray, "n k 3"]) -> FlatGaussians:

@@ -34,7 +34,8 @@ def test_materials_take_more_memory_and_time() -> None:
     plain, shiny = (
         estimated("standard", ImageSizes(400, 400, 100), materials=materials) for materials in (False, True)
     )
-    assert shiny.memory_bytes == pytest.approx(1.74e9, rel=0.05)  # private memory
+    # private memory: 1.74 GB were measured without residual colors, which take 0.11 GB more
+    assert shiny.memory_bytes == pytest.approx(1.85e9, rel=0.05)
     assert shiny.memory_bytes > plain.memory_bytes
     assert shiny.cpu_seconds > 2 * plain.cpu_seconds
 
