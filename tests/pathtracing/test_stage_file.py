@@ -217,3 +217,10 @@ def test_example_stages_are_valid(tmp_path: Path) -> None:
 def test_colors_are_read_under_their_former_key() -> None:
     former, present = (parse_stage(GOLD.format(key=key), "my.toml") for key in ("colour_srgb", "color_srgb"))
     assert former == present
+
+
+def test_up_of_an_environment_is_written_where_it_is_given_alone() -> None:
+    """Services and workers of former versions do not know it."""
+    assert "up" not in Environment(file="sky.hdr").model_dump(mode="json")
+    given = Environment(file="sky.hdr", up=(0, 1, 0))
+    assert Environment.model_validate(given.model_dump(mode="json")) == given

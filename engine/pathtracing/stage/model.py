@@ -228,7 +228,8 @@ class Environment(StageModel):
     """
 
     file: str
-    up: Vector | None = None
+    # not written where it is not given, as former versions, of services and of workers, do not know it
+    up: Vector | None = Field(None, exclude_if=lambda up: up is None)
     rotation_degrees: Finite = 0.0
     strength: NonNegative = 1.0
     visible: bool = True
