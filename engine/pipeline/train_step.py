@@ -44,7 +44,7 @@ from octasplat.engine.runs.run_folder import (
 from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.shading.recipes import material_shading
-from octasplat.engine.shading.residual_colors import ResidualColors, with_residual
+from octasplat.engine.shading.residual_colors import ResidualColors
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.train.config import TrainConfig, iteration_count, residual_iteration_count
 from octasplat.engine.train.initialization.initial_gaussians import initial_train_state
@@ -150,8 +150,7 @@ def _fit_residual(run: ReconstructionRun, trainer: Trainer, gaussians: FlatGauss
     materials = find_deferred(trainer.shading)
     assert materials is not None, "materials are learnt"
     tracer = make_tracer(config.trace, threads=run.threads)
-    tracer.build(with_residual(gaussians, residual_sh))
-    residual = ResidualColors(materials, tracer, residual_sh)
+    residual = ResidualColors(materials, gaussians, residual_sh, tracer)
     trainer.measure_views_again(add_residual(trainer.shading, residual))
     return iterations
 

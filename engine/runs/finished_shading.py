@@ -21,7 +21,7 @@ from octasplat.engine.runs.run_folder import (
 )
 from octasplat.engine.shading.deferred import DeferredShading
 from octasplat.engine.shading.protocol import ShadingModel
-from octasplat.engine.shading.residual_colors import ResidualColors, with_residual
+from octasplat.engine.shading.residual_colors import ResidualColors
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import TraceSettings
 from octasplat.engine.train.config import TrainConfig
@@ -100,8 +100,7 @@ def finished_shading(
     residual_sh = None if deferred is None or scene is None else read_residual(output, scene)
     if deferred is not None and scene is not None and residual_sh is not None:
         tracer = make_tracer(trace, threads=threads_in_use())
-        tracer.build(with_residual(scene, residual_sh))
-        shading = add_residual(shading, ResidualColors(deferred, tracer, residual_sh))
+        shading = add_residual(shading, ResidualColors(deferred, scene, residual_sh, tracer))
     if known is not None and (exposures := find_exposures(shading)) is not None:
         exposures.load_known(view_names, known)
     return shading

@@ -63,7 +63,9 @@ class ResidualColors(WrapperModel):
 
     Args:
         inner: the model of materials in the light that was learnt.
-        tracer: built around the Gaussians of :func:`with_residual`.
+        scene: Gaussians that are shaded.
+        residual_sh: harmonics of the residual color of each, display values.
+        tracer: is built around these, and kept.
 
     Attributes:
         residual_sh: harmonics of the residual colors.
@@ -73,9 +75,14 @@ class ResidualColors(WrapperModel):
     state_names: ClassVar[tuple[str, ...]] = ()
 
     def __init__(
-        self, inner: ShadingModel, tracer: Tracer, residual_sh: Float32[np.ndarray, "n k 3"]
+        self,
+        inner: ShadingModel,
+        scene: FlatGaussians,
+        residual_sh: Float32[np.ndarray, "n k 3"],
+        tracer: Tracer,
     ) -> None:
         super().__init__(inner)
+        tracer.build(with_residual(scene, residual_sh))
         self._tracer = tracer
         self.residual_sh = residual_sh
 

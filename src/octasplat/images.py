@@ -168,7 +168,7 @@ def render(
 
 def _with_residual(scene: Scene, materials: "DeferredShading", threads: int) -> "ShadingModel":
     """Return materials in the learnt light with the residual colors of the scene, where it has any."""
-    from octasplat.engine.shading.residual_colors import ResidualColors, with_residual
+    from octasplat.engine.shading.residual_colors import ResidualColors
     from octasplat.engine.trace.factory import make_tracer
 
     residual_sh = scene.residual_sh
@@ -180,8 +180,7 @@ def _with_residual(scene: Scene, materials: "DeferredShading", threads: int) -> 
             "show materials alone."
         )
     tracer = make_tracer(scene.trace_settings, threads=threads)
-    tracer.build(with_residual(scene.gaussians, residual_sh))
-    return ResidualColors(materials, tracer, residual_sh)
+    return ResidualColors(materials, scene.gaussians, residual_sh, tracer)
 
 
 def _background_color(background: Background) -> Float32[np.ndarray, "3"]:

@@ -11,7 +11,7 @@ from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
 from octasplat.engine.shading.exposure import ExposureModel
 from octasplat.engine.shading.plain import PlainShading
 from octasplat.engine.shading.protocol import LINEAR, ShadedRays, TracedRays
-from octasplat.engine.shading.residual_colors import ResidualColors, with_residual, with_residual_layers
+from octasplat.engine.shading.residual_colors import ResidualColors, with_residual_layers
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.train.shading_factory import add_residual, find_residual
 
@@ -51,9 +51,8 @@ def shaded_with(residual_srgb: np.ndarray) -> tuple[TracedRays, ShadedRays, Shad
     residual_sh[:, 0] = residual_srgb / np.float32(SH_C0)
     tracer, around = make_tracer(), make_tracer()
     tracer.build(scene)
-    around.build(with_residual(scene, residual_sh))
     traced = TracedRays(rays, tracer.trace(rays), tracer)
-    return traced, inner.shade(traced), ResidualColors(inner, around, residual_sh).shade(traced)
+    return traced, inner.shade(traced), ResidualColors(inner, scene, residual_sh, around).shade(traced)
 
 
 def test_residual_is_added_to_picture_and_radiance() -> None:
@@ -76,12 +75,11 @@ def test_no_residual_changes_nothing() -> None:
 
 def test_residual_lies_below_the_exposures() -> None:
     traced, *_ = shaded_with(WANTED_SRGB)
-    around = make_tracer()
     scene = plane_before_the_camera()
-    around.build(with_residual(scene, scene.sh + np.float32(0.3)))
     exposures = ExposureModel(1, rate=0.0, inner=_OneRadiance())
     exposures.log_gains[:] = np.log(0.5)
-    model = add_residual(exposures, ResidualColors(exposures.inner, around, scene.sh))
+    residual = ResidualColors(exposures.inner, scene, scene.sh + np.float32(0.3), make_tracer())
+    model = add_residual(exposures, residual)
     assert find_residual(model) is not None and find_residual(exposures) is None
     seen = replace(traced, view=np.zeros(len(traced.rays), np.int64))
     np.testing.assert_allclose(model.shade(seen).rgb_srgb, 0.5 * model.shade(traced).rgb_srgb, rtol=1e-5)
