@@ -201,7 +201,9 @@ def test_excess_is_found_in_the_structure_alone() -> None:
 
 
 @pytest.mark.parametrize(
-    "body", ['{"name": "é"}'.encode("latin-1"), gzip.compress(b'{"name": "a"}', mtime=0)], ids=["latin-1", "gzip"]
+    "body",
+    ['{"name": "é"}'.encode("latin-1"), gzip.compress(b'{"name": "a"}', mtime=0)],
+    ids=["latin-1", "gzip"],
 )
 def test_a_body_that_is_no_utf_8_is_refused_with_what_to_do(body: bytes) -> None:
     assert find_excess(body) == (
