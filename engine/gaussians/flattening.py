@@ -102,6 +102,7 @@ class ImportReport:
         thick: Gaussians whose ratio is more than ``MAX_THICKNESS_RATIO``, which a flat one cannot stand for.
         dropped: Gaussians left out because a value was not finite or a rotation had no length.
         notes: what else the reader left out or assumed, one sentence each.
+        kept: which rows of the file were read; None for all.
     """
 
     count: int
@@ -114,6 +115,7 @@ class ImportReport:
     thick: int = 0
     dropped: int = 0
     notes: tuple[str, ...] = ()
+    kept: Bool[np.ndarray, " m"] | None = field(default=None, repr=False, compare=False)
 
 
 def row_slices(count: int, rows_per_block: int = ROWS_PER_BLOCK) -> Iterator[slice]:
@@ -214,6 +216,7 @@ def flatten(
         thick=int((ratios > MAX_THICKNESS_RATIO).sum()),
         dropped=source.count - len(gaussians),
         notes=tuple(notes),
+        kept=None if kept.all() else kept,
     )
     return gaussians, report
 

@@ -32,10 +32,15 @@ MAX_ROUNDING = 0.01
 """Positions that are rounded to more than this share of a Gaussian's size are worth a warning."""
 
 
-def open_scene(
+def open_scene(path: Path, progress: EventListener, *, folder: Path | None = None) -> FlatGaussians:
+    """Return the Gaussians of a file of any format or of a run's folder, see :func:`open_reported_scene`."""
+    return open_reported_scene(path, progress, folder=folder)[0]
+
+
+def open_reported_scene(
     path: Path, progress: EventListener, *, drop_invalid: bool = False, folder: Path | None = None
-) -> FlatGaussians:
-    """Return the Gaussians of a file of any format or of a run's folder.
+) -> tuple[FlatGaussians, ImportReport]:
+    """Return the Gaussians of a file of any format or of a run's folder, and what reading them lost.
 
     Args:
         path: the file or folder.
@@ -50,7 +55,7 @@ def open_scene(
     report_dropped_on_import(path, report, progress)
     if is_run(path) and (left_out := unexported_parts(path)) is not None:
         progress(Warned(left_out))
-    return gaussians
+    return gaussians, report
 
 
 def open_scene_about(path: Path, origin_world: Origin, progress: EventListener) -> FlatGaussians:

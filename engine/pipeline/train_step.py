@@ -146,7 +146,7 @@ def _fit_residual(run: ReconstructionRun, trainer: Trainer, gaussians: FlatGauss
         iterations=iterations, excluded_views=trainer.state.excluded_views, threads=run.threads,
         should_stop=run.should_stop,
     )  # fmt: skip
-    write_residual(run.output, residual_sh)
+    write_residual(run.output, gaussians, residual_sh)
     materials = find_deferred(trainer.shading)
     assert materials is not None, "materials are learnt"
     tracer = make_tracer(config.trace, threads=run.threads)

@@ -410,18 +410,18 @@ def read_scene(path: Path, progress: EventListener, *, drop_invalid: bool = Fals
         ConfigError: a run's settings or light cannot be read.
     """
     from octasplat.engine.files import read_metadata
-    from octasplat.engine.operations.scene_io import open_scene
+    from octasplat.engine.operations.scene_io import open_reported_scene
     from octasplat.engine.runs.config import read_config
     from octasplat.engine.runs.finished_shading import learned_materials
     from octasplat.engine.runs.residual_file import read_residual
     from octasplat.engine.runs.run_folder import CONFIG, VIEWS, is_full_run, run_viewpoints
 
-    gaussians = open_scene(path, progress, drop_invalid=drop_invalid)
+    gaussians, report = open_reported_scene(path, progress, drop_invalid=drop_invalid)
     materials = learned_materials(path, gaussians)
     settings = read_config(path / CONFIG).train.trace if is_full_run(path) else None
     # Runs of old keep no cameras, and their photographs may be anywhere.
     viewpoints = run_viewpoints(path) if settings is not None and (path / VIEWS).exists() else None
-    residual_sh = None if materials is None else read_residual(path, gaussians)
+    residual_sh = None if materials is None else read_residual(path, gaussians, report.kept)
     return Scene(gaussians, read_metadata(path), materials, settings, viewpoints, residual_sh)
 
 

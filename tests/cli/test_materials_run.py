@@ -125,6 +125,24 @@ def test_residual_colors_are_shown_in_the_learnt_light_alone(materials_run, octa
     assert np.abs(shown - cropped).max() > 0.01
 
 
+def test_residual_colors_follow_the_rows_of_the_scene_that_are_read(materials_run, tmp_path):
+    run = shutil.copytree(materials_run, tmp_path / "run")
+    whole = osp.load(run)
+    assert whole.residual_sh is not None
+    # of another program: not finite here, rows reordered there
+    bad, content = [3, 10], (run / "scene.ply").read_bytes()
+    for row in bad:
+        content = content.replace(whole.means[row].tobytes(), np.float32([0, np.nan, 0]).tobytes(), 1)
+    (run / "scene.ply").write_bytes(content)
+    with pytest.raises(osp.OctasplatError, match="2 of"):
+        osp.load(run)
+    kept = osp.load(run, drop_invalid=True)
+    np.testing.assert_array_equal(kept.residual_sh, np.delete(whole.residual_sh, bad, axis=0))
+    osp.save(whole.select(np.arange(len(whole))[::-1]), run / "scene.ply")
+    with pytest.raises(osp.ConfigError, match=r"residual\.npz does not belong to the scene"):
+        osp.load(run)
+
+
 @pytest.mark.exhaustive
 def test_near_field_run_is_rendered_as_evaluated_and_relit_with_a_warning(scene, octasplat, tiny, tmp_path):
     near = ("--set", "materials.recipe=near_field")
