@@ -15,6 +15,8 @@ Box = tuple[float, float, float, float, float, float]
 NO_ORIGIN: Origin = (0.0, 0.0, 0.0)
 MAX_DISTANCE = 100.0
 """A centre farther than so many extents asks for a local origin: 32 bits leave 1e-5 of the extent there."""
+MAX_STEP = 0.01
+"""Gaussians in one place ask for a local origin where 32 bits leave more than this share of their size."""
 
 
 def choose_origin(centre: Float[np.ndarray, "3"], extent: float) -> Origin:
@@ -37,6 +39,24 @@ def choose_origin(centre: Float[np.ndarray, "3"], extent: float) -> Origin:
     step = 10.0 ** np.floor(np.log10(extent))
     x, y, z = (np.rint(np.asarray(centre, np.float64) / step) * step).tolist()
     return (x, y, z)
+
+
+def choose_origin_of_place(place: Float[np.ndarray, "3"], size: float) -> Origin:
+    """Return the local origin of Gaussians that are all in one place, zeros where 32 bits do for it.
+
+    Args:
+        place: where they are.
+        size: of one of them; 0 where it is not known.
+
+    >>> choose_origin_of_place(np.array([512345.6, 5403210.9, 310.2]), 2.0)
+    (512346.0, 5403211.0, 310.0)
+    >>> choose_origin_of_place(np.array([20.0, 3.0, 1.0]), 2.0)
+    (0.0, 0.0, 0.0)
+    """
+    if not np.isfinite(place).all():
+        return NO_ORIGIN
+    step = float(np.spacing(np.float32(np.abs(place).max())))
+    return choose_origin(place, size) if step > MAX_STEP * size else NO_ORIGIN
 
 
 def is_set(origin: Origin) -> bool:
@@ -125,7 +145,7 @@ def local_map(
 
 
 def origin_after(
-    matrix: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"], origin: Origin
+    matrix: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"], origin: Origin, size: float = 0.0
 ) -> Origin:
     """Return the local origin of points after an affine map of user coordinates.
 
@@ -133,6 +153,7 @@ def origin_after(
         matrix: the map.
         points: about ``origin``.
         origin: the local origin before.
+        size: of what is at a point, after the map; 0 where it is not known.
     """
     linear = np.asarray(matrix, np.float64)[:3, :3]
     carried = linear @ np.array(origin) + matrix[:3, 3]  # where the map takes the old local origin
@@ -140,7 +161,8 @@ def origin_after(
     centre = np.median(moved, axis=0)
     extent = float(np.median(np.linalg.norm(moved - centre, axis=1)))
     chosen = choose_origin(centre + carried, extent)
-    if extent == 0.0:  # of points in one place nothing says whether their coordinates are large
+    if extent == 0.0:  # of points in one place only their size says whether their coordinates are large
+        chosen = choose_origin_of_place(centre + carried, size)
         is_far = is_set(origin) and np.linalg.norm(carried) > MAX_DISTANCE * np.linalg.norm(centre)
     else:
         is_far = is_set(chosen) and is_set(origin) and np.linalg.norm(centre) <= MAX_DISTANCE * extent

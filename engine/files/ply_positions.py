@@ -7,7 +7,13 @@ bits, and say their origin in a comment.
 import numpy as np
 from jaxtyping import Float32
 
-from octasplat.engine.core.local_origin import NO_ORIGIN, Origin, choose_origin, is_set
+from octasplat.engine.core.local_origin import (
+    NO_ORIGIN,
+    Origin,
+    choose_origin,
+    choose_origin_of_place,
+    is_set,
+)
 from octasplat.engine.core.ply_container import PlyHeader, columns
 from octasplat.engine.files.place_comments import ORIGIN_KEY
 
@@ -36,7 +42,17 @@ def origin_of_positions(table: np.ndarray) -> Origin:
     centre = np.median(points, axis=0)
     with np.errstate(over="ignore"):  # of what is refused later
         extent = float(np.median(np.linalg.norm(points - centre, axis=1)))
+    if extent == 0.0:
+        return choose_origin_of_place(centre, _median_size(table[rows]))
     return choose_origin(centre, extent)
+
+
+def _median_size(table: np.ndarray) -> float:
+    """Return the median scale of some Gaussians of a table, 0 where it says none."""
+    names = [name for name in ("scale_0", "scale_1", "scale_2") if name in (table.dtype.names or ())]
+    logs = np.array([np.asarray(table[name], np.float64) for name in names])
+    with np.errstate(over="ignore"):
+        return float(np.exp(np.median(logs))) if np.isfinite(logs).all() and logs.size else 0.0
 
 
 def positions_about(table: np.ndarray, origin: Origin) -> Float32[np.ndarray, "n 3"]:

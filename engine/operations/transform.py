@@ -161,7 +161,8 @@ def run(
     matrix = request.world_map()
     scene, facts = scene_io.open_scene(source, progress), read_metadata(source)
     # of a scene far from the world's origin positions need another local one
-    origin = origin_after(matrix, scene.means_world, facts.origin_world)
+    size = mean_scale(matrix) * float(np.median(scene.scales))
+    origin = origin_after(matrix, scene.means_world, facts.origin_world, size)
     local = local_map(matrix, facts.origin_world, origin)
     moved = transform_gaussians(scene, local)
     stop_if(should_stop)

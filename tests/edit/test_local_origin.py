@@ -201,3 +201,20 @@ def test_render_takes_cameras_in_user_coordinates(octasplat, far, make_scene, tm
         pictures.append(read_image(out))
     np.testing.assert_array_equal(pictures[0], pictures[1])
     assert np.ptp(pictures[0]) > 0
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_gaussians_in_one_place_moved_to_map_coordinates_keep_their_digits(
+    octasplat, make_scene, tmp_path, count
+) -> None:
+    lone, far, back = tmp_path / "lone.ply", tmp_path / "far.ply", tmp_path / "back.ply"
+    write_gaussian_ply(make_scene(1).select(np.zeros(count, np.int64)), lone)
+    away = [str(value + 0.0625) for value in ORIGIN]
+    assert octasplat("transform", lone, "--translate", *away, "-o", far).exit_code == 0
+    np.testing.assert_allclose(user_positions(far) - ORIGIN - 0.0625, user_positions(lone), atol=1e-5)
+    home = [str(-value - 0.0625) for value in ORIGIN]
+    assert octasplat("transform", far, "--translate", *home, "-o", back).exit_code == 0
+    np.testing.assert_allclose(user_positions(back), user_positions(lone), atol=1e-5)
+    # a step aside keeps the coordinates as they are
+    assert octasplat("transform", lone, "--translate", "5", "0", "0", "-o", back).exit_code == 0
+    assert read_metadata(back).origin_world == NO_ORIGIN

@@ -249,11 +249,12 @@ def test_value_beyond_float32_is_nonfinite(make_gaussians: Make, tmp_path: Path)
         read_gaussian_ply(write_columns(tmp_path / "a.ply", columns))
 
 
+@pytest.mark.parametrize("count", [70, 1])
 @pytest.mark.parametrize("layout", ["binary_little_endian", "binary_big_endian", "ascii"])
 def test_map_coordinates_in_64_bits_keep_their_digits(
-    make_gaussians: Make, tmp_path: Path, layout: str
+    make_gaussians: Make, tmp_path: Path, layout: str, count: int
 ) -> None:
-    g = make_gaussians(70)
+    g = make_gaussians(count)
     placed = g.means_world.astype(np.float64) + np.array([691632.1, 5334761.4, 520.3])
     columns = columns_of(g) | dict(zip("xyz", placed.T, strict=True))
     path = write_columns(tmp_path / "a.ply", columns, layout)
