@@ -59,6 +59,8 @@ _POSES_OF_OTHERS = re.compile(
     r"(.*/)?(cameras\.xml|bundle\.out|[^/]+\.nvm|reconstruction\.json|(corrected_)?cameras/[^/]+\.json)",
     re.IGNORECASE,
 )
+# RealityScan, formerly RealityCapture, writes poses to both; so do others for other ends.
+_TABLE_SUFFIXES = frozenset({".xmp", ".csv"})
 # "Icon\r" is the icon of a folder on macOS; "." and ".." are not hidden files.
 _IGNORED_FILE = re.compile(
     r"(^|/)(__MACOSX/|\.(?!\.?(/|$))[^/]*|thumbs\.db$|desktop\.ini$|Icon\r?$)", re.IGNORECASE
@@ -280,6 +282,8 @@ _SENTENCES = {
     "archive": "{count} archives are left out ({names}); unpack them first.",
     "poses": "{count} files hold poses that are not read ({names}); put a COLMAP model into sparse/0, or the "
     "poses are found anew.",
+    "table": "{count} XMP and CSV files are left out ({names}); RealityScan (RealityCapture) poses in them "
+    "are not read: export its registration as a COLMAP model into sparse/0, or the poses are found anew.",
     "other": "{count} files are no part of a scene and are left out ({names}).",
 }
 
@@ -295,6 +299,8 @@ def _kind_of(path: str) -> str:
         return "video"
     if suffix in ARCHIVE_SUFFIXES:
         return "archive"
+    if suffix in _TABLE_SUFFIXES:
+        return "table"
     is_transforms = pure.name.startswith("transforms") and suffix == ".json"
     is_poses = is_transforms or _MODEL_ELSEWHERE.fullmatch(path) or _POSES_OF_OTHERS.fullmatch(path)
     return "poses" if is_poses else "other"

@@ -262,6 +262,16 @@ def test_poses_of_other_programs_are_told_as_poses() -> None:
     assert "COLMAP model into sparse/0" in told[0] and "(notes.json)" in told[1]
 
 
+def test_poses_of_reality_scan_are_told_with_the_way_out() -> None:
+    paths = ["images/a.jpg", "images/a.xmp", "b.XMP", "registration.csv", "control_points.csv", "notes.json"]
+    layout = lay_out_scene(paths)
+    assert set(layout.files) == {"images/a.jpg", "control_points.csv"}
+    told = left_out_sentences(layout.left_out)
+    assert len(told) == 2 and told[0].startswith("3 XMP and CSV files are left out (")
+    assert "RealityScan" in told[0] and "COLMAP" in told[0] and "registration.csv" in told[0]
+    assert "(notes.json)" in told[1]
+
+
 @pytest.mark.parametrize("name", ["images/a?.jpg", "images/con.jpg", "images/a.jpg ./b.jpg"])
 def test_photographs_of_names_that_not_every_system_takes_are_refused_before_they_are_sent(name: str) -> None:
     paths = [name, "images/b.jpg", "images/c.jpg", "images/d.jpg"]
