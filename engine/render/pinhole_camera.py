@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -16,9 +16,11 @@ _POSE_ERROR = 1e-2
 """Most by which rotation times its transpose may differ from the identity."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PinholeCamera:
     """A pinhole camera: looks along +z, x right, y down; pixel centres at +0.5.
+
+    Cameras are equal where all their numbers are.
 
     Attributes:
         width_px: Image width.
@@ -41,6 +43,18 @@ class PinholeCamera:
     rotation_cam_from_world: Float64[np.ndarray, "3 3"]
     translation_cam_from_world: Float64[np.ndarray, "3"]
     near_world: float = 0.0
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, PinholeCamera):
+            return NotImplemented
+        return self._values() == other._values()
+
+    def __hash__(self) -> int:
+        return hash(self._values())
+
+    def _values(self) -> tuple[object, ...]:
+        """Return all numbers, those of arrays in a row."""
+        return tuple(tuple(np.ravel(getattr(self, field.name)).tolist()) for field in fields(self))
 
     @classmethod
     def from_pose(

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -60,3 +62,15 @@ def test_what_is_no_pose_is_refused():
         camera(fy_px=-9.0)
     with pytest.raises(ConfigError, match="three finite numbers"):
         PinholeCamera.looking_at((0, 0), (0, 0, 1))
+
+
+def test_cameras_of_the_same_values_are_equal():
+    one, again = camera(), camera()
+    assert one == again and hash(one) == hash(again) and len({one, again}) == 1
+    assert one != camera(fy_px=10.0) and one != camera(width_px=9) and one != "camera"
+    pose = one.world_from_cam
+    pose[0, 3] += 1e-9
+    assert one != PinholeCamera.from_pose(pose, 8, 6, fy_px=9.0)
+    zero, minus = np.zeros(3), -np.zeros(3)
+    zeros = [replace(one, translation_cam_from_world=place) for place in (zero, minus)]
+    assert zeros[0] == zeros[1] and hash(zeros[0]) == hash(zeros[1])
