@@ -40,7 +40,7 @@ class Scene:
     ``means``, ``quats``, ``log_scales``, ``opacity_logits`` and ``sh`` are views: what is written to them
     changes the scene. What is assigned must have the same shape, but that ``sh`` may be of another degree.
 
-    >>> scene.means += np.float32([0, 0, 1])
+    >>> scene.means += np.array([0, 0, 1])
     """
 
     def __init__(

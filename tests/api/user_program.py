@@ -23,6 +23,8 @@ osp.save(scene, "b.spz")
 brighter = np.clip(scene.opacities * 1.1, 0, 0.99)
 scene.opacities = brighter
 scene.means[:, 2] += 1.0
+scene.means += np.array([0, 0, 0.5])
+scene.scales *= 2
 image = osp.render(scene, scene.camera(), background="white")
 assert_type(image, osp.Image)
 pose = np.eye(4)
