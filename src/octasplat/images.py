@@ -28,7 +28,7 @@ _EIGHT_BITS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 """Suffixes of formats that hold display values."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Image:
     """An image of a scene, rendered for one camera.
 

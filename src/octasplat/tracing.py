@@ -26,7 +26,7 @@ _MIN_ALPHA = 1e-8
 """Rays that met less than this have no depth."""
 
 
-@dataclass
+@dataclass(eq=False)
 class GaussianTensors:
     """The parameters of ``n`` flat Gaussians before their activations, as tensors on the CPU.
 
@@ -80,7 +80,7 @@ class GaussianTensors:
         return Scene(gaussians.copy(), self.facts, trained_with=self.trained_with)
 
 
-@dataclass
+@dataclass(eq=False)
 class Rays:
     """``r`` rays, which see what lies between ``t_min`` and ``t_max`` of their length.
 
@@ -122,7 +122,7 @@ class Rays:
         return Rays(origins, self.directions[which], self.t_min, self.t_max)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TracedRays:
     """Result of tracing rays through a scene.
 

@@ -259,3 +259,18 @@ def test_residual_colors_are_taken_as_the_kernels_need_them() -> None:
             scene.residual_sh = wrong
     scene.residual_sh = None
     assert scene.copy().residual_sh is None
+
+
+def test_pictures_rays_and_tensors_are_equal_to_themselves_alone(scene_file: Path) -> None:
+    scene = osp.load(scene_file).select([0, 1])
+    camera = scene.camera(width_px=4, height_px=3)
+    parameters, rays = osp.GaussianTensors.of(scene), osp.Rays.of(camera)
+    traced, again = (osp.trace(parameters, rays, threads=1) for _ in range(2))
+    pairs = [
+        (osp.render(scene, camera, threads=1), osp.render(scene, camera, threads=1)),
+        (rays, osp.Rays.of(camera)),
+        (parameters, osp.GaussianTensors.of(scene)),
+        (traced, again),
+    ]
+    for one, other in pairs:
+        assert one == one and one != other and len({one, other}) == 2
