@@ -48,7 +48,9 @@ def whole_progress(job: Job, stages: Sequence[str]) -> WholeProgress:
     weights = estimated or dict.fromkeys(stages, 1.0)
     if job.stage == OPTIONAL_STAGE and job.stage not in stages and "train" in stages:
         trained = stages.index("train") + 1
-        return WholeProgress(round(sum(weights[name] for name in stages[:trained]) / sum(weights.values()), 4))
+        return WholeProgress(
+            round(sum(weights[name] for name in stages[:trained]) / sum(weights.values()), 4)
+        )
     if job.stage is None or job.stage not in stages:
         before = stages.index("train") if job.stage in _BEFORE_TRAINING and "train" in stages else 0
         return WholeProgress(round(sum(weights[name] for name in stages[:before]) / sum(weights.values()), 4))
