@@ -13,6 +13,9 @@ _UNEVEN_STAGES = ("matches",)
 _BEFORE_TRAINING = ("check", "read", "features", "matches", "placing", "lenses")
 """Stages of poses and lenses in doubt, which nobody expects: all that precedes the training is done then."""
 
+OPTIONAL_STAGE = "residual"
+"""Follows the training where its settings say so, which blocks or trials may overrule."""
+
 
 @dataclass(frozen=True)
 class WholeProgress:
@@ -43,6 +46,11 @@ def whole_progress(job: Job, stages: Sequence[str]) -> WholeProgress:
         return WholeProgress()
     estimated = _stage_seconds(job.estimate, stages)
     weights = estimated or dict.fromkeys(stages, 1.0)
+    if job.stage == OPTIONAL_STAGE and job.stage not in stages and "train" in stages:
+        trained = stages.index("train") + 1
+        return WholeProgress(
+            round(sum(weights[name] for name in stages[:trained]) / sum(weights.values()), 4)
+        )
     if job.stage is None or job.stage not in stages:
         before = stages.index("train") if job.stage in _BEFORE_TRAINING and "train" in stages else 0
         return WholeProgress(round(sum(weights[name] for name in stages[:before]) / sum(weights.values()), 4))
@@ -66,5 +74,7 @@ def whole_progress(job: Job, stages: Sequence[str]) -> WholeProgress:
 def _stage_seconds(estimate: Mapping[str, Any] | None, stages: Sequence[str]) -> dict[str, float] | None:
     """Return the estimated seconds of all stages, or None where one is not known or all are 0."""
     known = (estimate or {}).get("stage_seconds") or {}
+    if "train" in known:  # former estimates have both in one
+        known = {OPTIONAL_STAGE: 0.0, **known}
     found = {name: float(known[name]) for name in stages if name in known}
     return found if len(found) == len(stages) and any(found.values()) else None

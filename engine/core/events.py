@@ -28,7 +28,10 @@ class Event:
 
 @dataclass(frozen=True)
 class PhaseStarted(Event):
-    """A stage of a job begins; a reconstruction has ``load``, ``train``, ``evaluate`` and ``export``."""
+    """A stage of a job begins; a reconstruction has ``load``, ``train``, ``evaluate`` and ``export``.
+
+    One that fits residual colors has ``residual`` after ``train``.
+    """
 
     kind: ClassVar[str] = "stage_started"
     stage: str
@@ -61,7 +64,11 @@ class PhaseFinished(Event):
 
 @dataclass(frozen=True)
 class TrainingProgress(Event):
-    """State of the training after ``iteration``; ``psnr`` is the running value over training rays, in dB."""
+    """State of the training after ``iteration``; ``psnr`` is the running value over training rays, in dB.
+
+    ``seconds_left`` is until there is a scene; ``seconds_after`` of it are for residual colors, whose stage
+    follows.
+    """
 
     kind: ClassVar[str] = "training_progress"
     iteration: int
@@ -73,6 +80,7 @@ class TrainingProgress(Event):
     hits_per_ray: float
     seconds: float
     seconds_left: float
+    seconds_after: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from octasplat.engine.core.events import Event, EventListener, PhaseFinished, Ph
 PHASE_TITLES = {
     "load": "Loading",
     "train": "Training",
+    "residual": "Fitting residual colors",
     "evaluate": "Evaluating",
     "export": "Exporting",
     "generate": "Generating",

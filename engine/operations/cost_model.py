@@ -18,11 +18,11 @@ from octasplat.engine.poses.config import DEFAULT_CONFIG, MAX_IMAGE_SIDE_PX
 from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.runs.result_files import SURFACE_GLB
 from octasplat.engine.train.config import (
-    ITERATIONS_PER_BATCH,
     KEPT_BATCHES,
     TrainConfig,
     iteration_count,
     max_gaussian_count,
+    residual_cost_share,
     uses_shared_sort,
 )
 
@@ -69,8 +69,6 @@ _FITTED_GAUSSIANS = 200_000
 _MATERIAL_RAY_CPU_SECONDS = 2.1e-5
 """For a ray with what it reflects, of a training with materials of so many Gaussians."""
 _MATERIAL_GAUSSIANS = 80_000
-_SHADED_SHARE = 0.5
-"""Of that, forward alone: rays of the fit of residual colors, one batch for several iterations."""
 _SHADED_RAY_BYTES = 54
 """For a ray of each batch that this fit keeps, beyond what the training had and is free by then: 113 MB more
 were measured with 256 batches of 8,192 rays (a lamp of 64 views of 200 px, ``fast``)."""
@@ -177,6 +175,9 @@ def estimate_reconstruction(
     training_cpu_seconds = iterations * train.rays_per_batch * _ray_cpu_seconds(train, gaussians)
     if options.minutes is not None:  # the time is given: it is used up
         training_cpu_seconds = 60 * options.minutes * max(1, cores) ** _CORE_POWER
+    else:
+        training_cpu_seconds *= 1 + residual_cost_share(train)
+    residual_cpu_seconds = training_cpu_seconds * (1 - 1 / (1 + residual_cost_share(train)))
     materials = train.materials.learn
     each_pixel = _MATERIAL_EVALUATE_CPU_SECONDS_PER_PIXEL if materials else _EVALUATE_CPU_SECONDS_PER_PIXEL
     full_pixels = sum(sizes.width_px * sizes.height_px * sizes.count for sizes in photographs)
@@ -186,7 +187,8 @@ def estimate_reconstruction(
     stages = {
         **search,
         "load": _START_CPU_SECONDS + _LOAD_CPU_SECONDS_PER_PIXEL * full_pixels,
-        "train": lifting + training_cpu_seconds,
+        "train": lifting + training_cpu_seconds - residual_cpu_seconds,
+        **({"residual": residual_cpu_seconds} if residual_cpu_seconds else {}),
         "evaluate": held_out_views * (_EVALUATE_CPU_SECONDS_PER_VIEW + each_pixel * pixels / max(count, 1)),
         "export": _export_cpu_seconds(options, gaussians),
     }
@@ -197,7 +199,7 @@ def estimate_reconstruction(
     if materials:
         # the largest of both phases: they follow each other
         training = max(training + _MATERIAL_TRAIN_BYTES, _MATERIAL_START_BYTES)
-        if train.materials.residual_share:
+        if residual_cpu_seconds:
             training += KEPT_BATCHES * train.rays_per_batch * _SHADED_RAY_BYTES
     memory = _START_BYTES + model_bytes(count) + max(training, _PIXEL_BYTES * largest)
     if finds_poses:  # before the training, by a process of its own
@@ -390,10 +392,7 @@ def _ray_cpu_seconds(train: TrainConfig, gaussians: int) -> float:
     seconds = max(_RAY_CPU_SECONDS * near**_RAY_POWER * far**_FAR_RAY_POWER, _LEAST_RAY_CPU_SECONDS)
     if train.materials.learn:
         lit = float(_MATERIAL_RAY_CPU_SECONDS * (gaussians / _MATERIAL_GAUSSIANS) ** _FAR_RAY_POWER)
-        residual = (train.materials.residual_share or 0.0) * (
-            seconds + _SHADED_SHARE / ITERATIONS_PER_BATCH * lit
-        )
-        return lit + float(seconds if train.loss.edges else 0) + float(residual)
+        return lit + float(seconds if train.loss.edges else 0)
     saved = _SHARED_SORT_SAVING * train.shared_sort_until if uses_shared_sort(train) else 0.0
     return float(seconds * (1 - saved))
 

@@ -171,7 +171,7 @@ def _costs(
         only = PlannedBlock(
             photographs=blocks[0].view_count,
             pixels=blocks[0].pixel_count,
-            seconds=whole.stage_seconds["train"],
+            seconds=whole.stage_seconds["train"] + whole.stage_seconds.get("residual", 0.0),
             memory_bytes=whole.memory_bytes,
         )
         figures = {"seconds": whole.seconds, "memory_bytes": whole.memory_bytes}

@@ -3,14 +3,15 @@
 import json
 import time
 from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
 
 from octasplat.engine.core import versions
-from octasplat.engine.core.events import EventListener, Noted, Warned
-from octasplat.engine.core.progress import PhaseClock, phase
+from octasplat.engine.core.events import Event, EventListener, Noted, TrainingProgress, Warned
+from octasplat.engine.core.progress import PhaseClock, ProgressCallback, counted_phase, phase
 from octasplat.engine.core.threads import use_threads
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset import Dataset
@@ -46,7 +47,13 @@ from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.shading.recipes import material_shading
 from octasplat.engine.shading.residual_colors import ResidualColors
 from octasplat.engine.trace.factory import make_tracer
-from octasplat.engine.train.config import TrainConfig, iteration_count, residual_iteration_count
+from octasplat.engine.train.config import (
+    TrainConfig,
+    has_residual_colors,
+    iteration_count,
+    residual_cost_share,
+    residual_iteration_count,
+)
 from octasplat.engine.train.initialization.initial_gaussians import initial_train_state
 from octasplat.engine.train.loop.checkpoint import (
     load_latest_checkpoint,
@@ -108,43 +115,89 @@ class TrainStep:
             )
         with phase("train", run.progress, steps) as clock:
             clock.add(choosing_s)
-            gaussians = _train(run, clock)
-            facts = SceneMetadata(
-                near_world=dataset.near_world,
-                pixel_rad=training_pixel_angle(dataset.viewpoints),
-                turned_beyond=config.train.trace.flip_normal_cos,
-                origin_world=dataset.origin_world,
-            )
-            write_gaussian_ply(gaussians, run.output / SCENE, facts=facts)
+            if (count := count_blocks(run)) > 1:
+                _write_scene(run, _train_in_blocks(run, count))
+                return
+            trained = _train(run, clock)
+            fits = residual_iteration_count(trained.trainer.config, trained.trainer.state.iteration)
+            if not fits:
+                (run.output / RESIDUAL).unlink(missing_ok=True)  # of a training that was begun anew
+                trained.write(run, clock.stop())
+        if fits:  # its own stage: what was trained is in a checkpoint, and the scene is there after both
+            began = time.perf_counter()
+            with counted_phase("residual", run.progress, fits) as count_steps:
+                _fit_residual(run, trained.trainer, trained.gaussians, fits, count_steps)
+                seconds = clock.seconds() + time.perf_counter() - began
+                trained.write(run, seconds, residual_iterations=fits)
 
 
-def _train(run: ReconstructionRun, clock: PhaseClock) -> FlatGaussians:
-    if (count := count_blocks(run)) > 1:
-        return _train_in_blocks(run, count)
+def _write_scene(run: ReconstructionRun, gaussians: FlatGaussians) -> None:
+    """Write the scene, with which the training is done."""
+    dataset = run.dataset
+    facts = SceneMetadata(
+        near_world=dataset.near_world,
+        pixel_rad=training_pixel_angle(dataset.viewpoints),
+        turned_beyond=run.config.train.trace.flip_normal_cos,
+        origin_world=dataset.origin_world,
+    )
+    write_gaussian_ply(gaussians, run.output / SCENE, facts=facts)
+
+
+@dataclass(frozen=True)
+class _Trained:
+    """A training of the whole scene that has ended, and what its files need."""
+
+    trainer: Trainer
+    gaussians: FlatGaussians
+    nearest_world: Float64[np.ndarray, " views"]
+    keeps_near_free: bool
+
+    def write(self, run: ReconstructionRun, seconds: float, *, residual_iterations: int = 0) -> None:
+        """Write the record of the training, then the scene."""
+        _write_training_record(
+            self.trainer, run.dataset, self.nearest_world, seconds, run.output,
+            keeps_near_free=self.keeps_near_free, residual_iterations=residual_iterations,
+        )  # fmt: skip
+        _write_scene(run, self.gaussians)
+
+
+def _train(run: ReconstructionRun, clock: PhaseClock) -> _Trained:
     config = _plan_settings(run, clock)
     nearest_world = camera_clearances(run.dataset.viewpoints, run.dataset.points)
     trainer = _make_trainer(run, config, nearest_world, clock)
     gaussians = trainer.run()
     _write_learnt_light(trainer.shading, gaussians, run.output, run.progress)
-    fitted = _fit_residual(run, trainer, gaussians)
-    _write_training_record(
-        trainer, run.dataset, nearest_world, clock, run.output,
-        keeps_near_free=config.camera_clearance > 0, residual_iterations=fitted,
-    )  # fmt: skip
-    return gaussians
+    return _Trained(trainer, gaussians, nearest_world, config.camera_clearance > 0)
 
 
-def _fit_residual(run: ReconstructionRun, trainer: Trainer, gaussians: FlatGaussians) -> int:
-    """Fit and write residual colors where a training with materials asks for them; return the iterations."""
-    config, done = trainer.config, trainer.state.iteration
-    if not (iterations := residual_iteration_count(config, done)):
-        (run.output / RESIDUAL).unlink(missing_ok=True)  # of a training that was begun anew
-        return 0
-    run.progress(Noted(f"Fitting residual colors, {iterations:,} iterations with all else kept."))
+def _with_residual_time(progress: EventListener, config: TrainConfig) -> EventListener:
+    """Return a listener that adds the fit of residual colors to the time that a training still takes."""
+    if not has_residual_colors(config):
+        return progress
+
+    def listen(event: Event) -> None:
+        if isinstance(event, TrainingProgress):
+            pace_s = config.rays_per_batch / event.rays_per_second
+            after = residual_cost_share(config) * event.total_iterations * pace_s
+            event = replace(event, seconds_left=event.seconds_left + after, seconds_after=after)
+        progress(event)
+
+    return listen
+
+
+def _fit_residual(
+    run: ReconstructionRun,
+    trainer: Trainer,
+    gaussians: FlatGaussians,
+    iterations: int,
+    progress: ProgressCallback,
+) -> None:
+    """Fit and write residual colors after a training with materials."""
+    config = trainer.config
     residual_sh = fit_residual_colors(
         gaussians, trainer.dataset, trainer.shading, config,
         iterations=iterations, excluded_views=trainer.state.excluded_views, threads=run.threads,
-        should_stop=run.should_stop,
+        should_stop=run.should_stop, progress=progress,
     )  # fmt: skip
     write_residual(run.output, gaussians, residual_sh)
     materials = find_deferred(trainer.shading)
@@ -152,7 +205,6 @@ def _fit_residual(run: ReconstructionRun, trainer: Trainer, gaussians: FlatGauss
     tracer = make_tracer(config.trace, threads=run.threads)
     residual = ResidualColors(materials, gaussians, residual_sh, tracer)
     trainer.measure_views_again(add_residual(trainer.shading, residual))
-    return iterations
 
 
 def _train_in_blocks(run: ReconstructionRun, count: int) -> FlatGaussians:
@@ -202,7 +254,7 @@ def _make_trainer(
         state,
         folder=folder,
         fingerprint=fingerprint,
-        progress=progress,
+        progress=_with_residual_time(progress, config),
         threads=run.threads,
         should_stop=run.should_stop,
         min_scale=MinScale.of_views(dataset.viewpoints, dataset.train_indices, config.min_scale_px),
@@ -253,14 +305,14 @@ def _write_training_record(
     trainer: Trainer,
     dataset: Dataset,
     nearest_world: Float64[np.ndarray, " views"],
-    clock: PhaseClock,
+    seconds: float,
     output: Path,
     *,
     keeps_near_free: bool,
     residual_iterations: int,
 ) -> None:
     """Write the facts on a finished training that later steps and commands need."""
-    record: dict[str, object] = {"seconds": clock.stop(), "iterations": trainer.state.iteration}
+    record: dict[str, object] = {"seconds": seconds, "iterations": trainer.state.iteration}
     if trainer.schedule.early_stop_at is not None:
         record["planned_iterations"] = trainer.schedule.planned_iterations
     if trainer.views is not None:

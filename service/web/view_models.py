@@ -16,6 +16,7 @@ from octasplat.service.schemas.jobs import JobView
 from octasplat.service.state import Service
 from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
 from octasplat.service.web.results import METRICS, mean_psnr, read_json
+from octasplat.service.whole_progress import OPTIONAL_STAGE
 from octasplat.workers.client.short_ids import short_id
 from octasplat.workers.db.connections import Connection, select_columns
 from octasplat.workers.db.datasets import files_of, get_dataset
@@ -210,6 +211,12 @@ def _stage_rows(job: JobView, spent: dict[str, Any]) -> list[StageRow]:
     over = job.state == "succeeded"
     names = _with_unexpected_stages(job.stages, [*spent, *([job.stage] if job.stage else [])])
     place = names.index(job.stage) if job.stage in names else -1
+    if OPTIONAL_STAGE in names and OPTIONAL_STAGE not in spent:
+        skipped = names.index(OPTIONAL_STAGE)
+        # trials before the training may have left materials out, or taken another recipe
+        if over or place > skipped:
+            del names[skipped]
+            place -= place > skipped
     lines = []
     for k, name in enumerate(names):
         past = over or k < place or (k != place and name in spent)

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from octasplat.engine.core.errors import CancelledError, ConfigError
-from octasplat.engine.core.events import Event, EventListener, TrainingProgress
+from octasplat.engine.core.events import Event, EventListener, PhaseProgress, TrainingProgress
 from octasplat.notebook import default_progress, table_html
 from octasplat.operation_calls import explicit_values, run_operation
 from octasplat.paths import PathLike
@@ -22,7 +23,10 @@ _CONFIG, _EDITS, _METRICS, _REPORT, _SCENE, _TRAINING = (
     "config.json", "edits.json", "metrics.json", "report.html", "scene.ply", "training.json",
 )  # fmt: skip
 OnStep = Callable[[TrainingProgress], bool | None]
-"""Called with the state of the training every few iterations; returning False stops it."""
+"""Called with the state of the training every few iterations; returning False stops it.
+
+While residual colors are fitted, it is called with the last state and the time that this still takes.
+"""
 
 
 def reconstruct_run(
@@ -50,11 +54,17 @@ def reconstruct_run(
         {name: value for name, value in given.items() if name in ReconstructOptions.model_fields}
     )
     stopped = False
+    trained: TrainingProgress | None = None
     listener = progress or default_progress()
 
     def listen(event: Event) -> None:
-        nonlocal stopped
+        nonlocal stopped, trained
         listener(event)
+        if isinstance(event, TrainingProgress):
+            trained = event
+        elif trained is not None and isinstance(event, PhaseProgress) and event.stage == "residual":
+            left = (1 - event.step / event.total_steps) * trained.seconds_after
+            event = replace(trained, seconds_left=left, seconds_after=left)
         if on_step is not None and isinstance(event, TrainingProgress) and on_step(event) is False:
             # It ends at the next safe point, where should_stop is asked.
             stopped = True

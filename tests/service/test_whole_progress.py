@@ -83,3 +83,28 @@ def test_stages_that_nobody_expects_come_before_the_training(
     )
     found = whole_progress(job, stages)
     assert found.share == pytest.approx(share, abs=1e-4) and found.seconds_left is None
+
+
+@pytest.mark.parametrize(
+    ("seconds", "stages", "stage", "share", "left"),
+    [
+        ({"train": 30.0, "residual": 10.0}, ["train", "residual"], "train", 0.375, 25.0),
+        ({"train": 30.0, "residual": 10.0}, ["train", "residual"], "residual", 0.875, 15.0),
+        ({"train": 40.0}, ["train", "residual"], "train", 0.5, 15.0),  # estimated by a former version
+        ({"train": 40.0, "evaluate": 10.0}, ["train", "evaluate"], "residual", 0.8, None),  # unexpected
+    ],
+)
+def test_fit_of_residual_colors_counts(
+    seconds: dict[str, float], stages: list[str], stage: str, share: float, left: float | None
+) -> None:
+    job: Any = SimpleNamespace(
+        state="running",
+        is_over=False,
+        stage=stage,
+        step=50,
+        total_steps=100,
+        seconds_left=15.0,
+        estimate={"stage_seconds": seconds},
+    )
+    found = whole_progress(job, stages)
+    assert (found.share, found.seconds_left) == (share, left)

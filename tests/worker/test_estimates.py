@@ -49,3 +49,15 @@ def test_estimate_counts_memory_of_search_for_poses() -> None:
         for poses in ("given", "auto")
     )
     assert given < 2e9 and 3.8e9 / 1.2 < found < 3.8e9 * 1.2
+
+
+@pytest.mark.parametrize("minutes", [None, 10])
+def test_fit_of_residual_colors_is_a_stage_of_its_own(minutes: float | None) -> None:
+    sizes = [ImageSizes(400, 400, 100)]
+    config = resolve_config("fast", materials=True).model_copy(update={"minutes": minutes})
+    stages = estimate_reconstruction(config, sizes, 1).stage_seconds
+    assert stages["residual"] / stages["train"] == pytest.approx(0.17 * 1.6, rel=0.02)
+    if minutes is not None:
+        assert stages["residual"] + stages["train"] == pytest.approx(600, rel=0.05)
+    plain = resolve_config("fast").model_copy(update={"minutes": minutes})
+    assert "residual" not in estimate_reconstruction(plain, sizes, 1).stage_seconds

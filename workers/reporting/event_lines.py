@@ -24,6 +24,7 @@ LINE_INTERVAL_SECONDS = 5.0
 _STAGE_RESULTS = {
     "load": ("Loaded", "photograph"),
     "train": ("Trained", "iteration"),
+    "residual": ("Fitted residual colors", ""),
     "evaluate": ("Evaluated", "view"),
     "export": ("Exported", "file"),
     "generate": ("Generated", "photograph"),

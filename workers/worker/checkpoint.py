@@ -59,7 +59,8 @@ class Checkpoint:
 
     def is_after(self, other: "Checkpoint | None") -> bool:
         """Return whether the work is further than at ``other``."""
-        order = {"features": -2, "matches": -1, "poses": 0, "load": 1, "train": 2, "evaluate": 3, "export": 4}
+        stages = ("features", "matches", "poses", "load", "train", "residual", "evaluate", "export")
+        order = {stage: place - stages.index("poses") for place, stage in enumerate(stages)}
         if other is None:
             return True
         return (order.get(self.stage, 0), self.step) > (order.get(other.stage, 0), other.step)

@@ -144,7 +144,8 @@ class Reporter:
                     "stage": self._stage,
                     "step": event["iteration"],
                     "total_steps": self._steps,
-                    "seconds_left": event["seconds_left"],
+                    # what follows is a stage of its own
+                    "seconds_left": event["seconds_left"] - event.get("seconds_after", 0.0),
                     "training_psnr": event["psnr"],
                     "event": encode_training_progress(event),
                 }
@@ -156,8 +157,8 @@ class Reporter:
             if self._progress is not None and "event" in self._progress:
                 self._events.append(("progress", self._progress.pop("event")))
             self._keeps_progress = self._keeps_progress and event["stage"] != "train"
-            if event["stage"] in ("poses", "placing", "lenses", "train"):
-                self._want_checkpoint(self._steps if event["stage"] in ("poses", "train") else 0)
+            if event["stage"] in ("poses", "placing", "lenses", "train", "residual"):
+                self._want_checkpoint(self._steps if event["stage"] in ("poses", "train", "residual") else 0)
         elif kind == BlocksPlanned.kind:
             self.blocks_planned = read_planned_blocks(event)
         elif kind == "preview_written":

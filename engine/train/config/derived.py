@@ -123,8 +123,19 @@ def rebuild_interval(rebuild_every: int, gaussians: int) -> int:
     return rebuild_every * (1 + gaussians // GAUSSIANS_PER_REBUILD_INTERVAL)
 
 
+def has_residual_colors(config: TrainConfig) -> bool:
+    """Return whether residual colors are fitted after a training of the whole scene."""
+    return config.materials.learn and bool(config.materials.residual_share)
+
+
+def residual_cost_share(config: TrainConfig) -> float:
+    """Return how long the fit of residual colors takes, as a share of the training before it; 0: none."""
+    share = config.materials.residual_share or 0.0
+    return RESIDUAL_ITERATION_COST * share if has_residual_colors(config) else 0.0
+
+
 def residual_iteration_count(config: TrainConfig, iterations: int) -> int:
     """Return how many iterations fit residual colors after a training of so many; 0: there are none."""
-    if not config.materials.learn:
+    if not has_residual_colors(config):
         return 0
     return round((config.materials.residual_share or 0.0) * iterations)

@@ -5,6 +5,7 @@ Materials and light explain a part of each photograph; the rest is fitted by har
 an iteration takes a fraction of one that shades, as what materials show along a ray is computed once.
 """
 
+import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -13,6 +14,7 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from octasplat.engine.core.errors import CancelledError
+from octasplat.engine.core.progress import ProgressCallback
 from octasplat.engine.core.threads import use_threads
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.shading.protocol import (
@@ -49,6 +51,8 @@ RATES = LearningRates(color=0.003, sh_rest_ratio=0.3, decay=0.1, quat=0, log_sca
 )
 """Steps of the harmonics; nothing else moves."""
 NO_REGULARIZATION = LossWeights().model_copy(update={"opacity": 0.0, "scale": 0.0})
+PROGRESS_SECONDS = 0.5
+"""Between two reports of the progress."""
 _SEED_STREAM = 1
 """Tells this generator from that of the training, which has the seed alone."""
 
@@ -90,6 +94,7 @@ def fit_residual_colors(
     excluded_views: Int64[np.ndarray, " m"],
     threads: int = 0,
     should_stop: Callable[[], bool] = lambda: False,
+    progress: ProgressCallback = lambda done, total, part=0.0: None,
 ) -> Float32[np.ndarray, "n k 3"]:
     """Return harmonics of the residual color of each Gaussian, display values.
 
@@ -104,6 +109,7 @@ def fit_residual_colors(
         excluded_views: training views of which nothing is drawn.
         threads: for everything; 0 means all cores.
         should_stop: asked before each iteration.
+        progress: called with the iterations done at the beginning, now and then, and at the end.
 
     Raises:
         CancelledError: stopped as asked.
@@ -123,7 +129,11 @@ def fit_residual_colors(
         source.exclude_views(excluded_views)
     rng = np.random.default_rng([config.seed, _SEED_STREAM])
     adam, average, kept = Adam.zeros(scene), WeightAverage(), deque[_ShadedBatch](maxlen=KEPT_BATCHES)
+    reported_at = -PROGRESS_SECONDS
     for iteration in range(iterations):
+        if time.monotonic() - reported_at >= PROGRESS_SECONDS:
+            reported_at = time.monotonic()
+            progress(iteration, iterations)
         if should_stop():
             raise CancelledError(
                 "Stopped while residual colors were fitted; the same command with --resume goes on."
@@ -155,6 +165,7 @@ def fit_residual_colors(
         left = iterations - 1 - iteration
         if left < AVERAGED_SHARE * iterations and left % AVERAGING_INTERVAL == 0:
             average.add(scene)
+    progress(iterations, iterations)
     mean = average.gaussians
     return scene.sh if mean is None else mean.sh
 

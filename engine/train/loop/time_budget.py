@@ -16,9 +16,9 @@ from octasplat.engine.dataset import Dataset
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.train.config import (
     MAX_PLANNED_ITERATIONS,
-    RESIDUAL_ITERATION_COST,
     TrainConfig,
     max_gaussian_count,
+    residual_cost_share,
     uses_shared_sort,
 )
 from octasplat.engine.train.loop.trial_training import seconds_per_iteration
@@ -121,8 +121,7 @@ def make_plan(
     pace_s = seconds_per_iteration(dataset, config, first, threads=threads, should_stop=should_stop)
     if uses_shared_sort(config):  # as the trial was, and the first part of the training is
         pace_s *= config.shared_sort_until + RAY_SORT_SLOWDOWN * (1 - config.shared_sort_until)
-    if config.materials.learn:  # residual colors are fitted within the time, too
-        pace_s *= 1 + RESIDUAL_ITERATION_COST * (config.materials.residual_share or 0.0)
+    pace_s *= 1 + residual_cost_share(config)  # residual colors are fitted within the time, too
     left_s = USED_FRACTION * (seconds - (time.perf_counter() - began))
     max_gaussians = max_gaussian_count(config, dataset.train_pixel_count, valid_pixel_fraction(dataset))
     least = max(MIN_GAUSSIANS, len(first)) if keeps_first else MIN_GAUSSIANS

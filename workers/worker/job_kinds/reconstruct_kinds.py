@@ -19,7 +19,12 @@ from octasplat.engine.operations.reconstruct import OPERATION as RECONSTRUCT
 from octasplat.engine.operations.reconstruct import options_from_json
 from octasplat.engine.runs.config import ReconstructionConfig, revise_requested
 from octasplat.engine.settings.refusals import InvalidSettingsError, Refusal
-from octasplat.engine.train.config import MAX_PLANNED_ITERATIONS, iteration_count, max_gaussian_count
+from octasplat.engine.train.config import (
+    MAX_PLANNED_ITERATIONS,
+    has_residual_colors,
+    iteration_count,
+    max_gaussian_count,
+)
 from octasplat.workers.worker.job_kinds.operation_kind import OperationKind
 from octasplat.workers.worker.job_kinds.registry import JobKind
 from octasplat.workers.worker.job_kinds.resource_limits import ResourceDemand
@@ -105,7 +110,9 @@ class ReconstructKind(OperationKind):
 
     def stages(self, options: ReconstructJobConfig) -> tuple[str, ...]:
         """Return the stages, those that find poses among them if there are none, nor any of a source job."""
-        stages = ("load", "train", "evaluate", "export")
+        is_whole = options.blocks in (None, 1)  # trainings in blocks have no residual colors
+        fits = is_whole and has_residual_colors(options.train)
+        stages = ("load", "train", *(("residual",) if fits else ()), "evaluate", "export")
         is_posed = options.poses == "given" or options.begins_with_source
         return stages if is_posed else ("read", "features", "matches", "poses", *stages)
 
