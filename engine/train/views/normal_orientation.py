@@ -8,6 +8,7 @@ what has just turned away from the viewer from what has not (``flip_normal_cos``
 import numpy as np
 from jaxtyping import Float64, Int32, Int64
 
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.trace.protocol import TraceGradients, Tracer
 from octasplat.engine.train.sampling.batches import grid_pixels
@@ -19,12 +20,23 @@ GRID_TILES = 6
 See :func:`octasplat.engine.train.sampling.batches.grid_pixels`.
 """
 VIEWS_PER_TRACE = 8
+VISIBLE_TRANSMITTANCE = 0.5
+"""A view sees a Gaussian where at least this much of the light between its mean and the camera gets through."""
+VISIBILITY_GAP = 0.003
+"""How far before the mean that way ends, of its length, or the larger scale of the Gaussian where that is more."""
+MAX_VISIBILITY_RAYS = 1 << 18
+"""So many of these ways are traced at once."""
 
 
 def orient_normals(
     gaussians: FlatGaussians, dataset: TrainingData, indices: Int64[np.ndarray, " v"], tracer: Tracer
 ) -> Int32[np.ndarray, " t"]:
     """Turn Gaussians over, in place, that are mostly seen from behind.
+
+    Those whose normal points away from the views in which they weigh most are looked at more closely: a
+    surface that few views see at grazing angles weighs less in these than in the many views on the other side
+    that see it faintly through what hides it. Such a Gaussian is turned only where most of the views that see
+    its mean unhidden see it from behind; one that no view sees so stays as it is.
 
     A Gaussian that is turned looks as before: only its normal points the other way.
 
@@ -44,7 +56,9 @@ def orient_normals(
             len(gaussians), dataset, indices[start : start + VIEWS_PER_TRACE], tracer
         )
     normals = gaussians.rotations[:, :, 0].astype(np.float64)
-    flipped_ids = np.flatnonzero((normals * towards).sum(axis=1) < 0).astype(np.int32)
+    candidates = np.flatnonzero((normals * towards).sum(axis=1) < 0).astype(np.int32)
+    towards_seen = _summed_directions_of_sight(gaussians, candidates, _view_origins(dataset, indices), tracer)
+    flipped_ids = candidates[(normals[candidates] * towards_seen).sum(axis=1) < 0]
     gaussians.quats_wxyz[flipped_ids] = _flip_frames(gaussians.quats_wxyz[flipped_ids])
     return flipped_ids
 
@@ -65,6 +79,42 @@ def _summed_view_directions(
     found = tracer.backward(seen.recording, given).numpy()
     sums = np.zeros((count, 3))
     sums[found.ids] = found.features[:, :3]
+    return sums
+
+
+def _view_origins(dataset: TrainingData, indices: Int64[np.ndarray, " v"]) -> Float64[np.ndarray, "v 3"]:
+    """Return where the cameras of views stand."""
+    corner = np.zeros(len(indices), np.int64)
+    origins = dataset.rays(indices, corner, corner).origins_world.astype(np.float64)
+    return np.broadcast_to(origins, (len(indices), 3))
+
+
+def _summed_directions_of_sight(
+    gaussians: FlatGaussians,
+    ids: Int32[np.ndarray, " c"],
+    origins_world: Float64[np.ndarray, "v 3"],
+    tracer: Tracer,
+) -> Float64[np.ndarray, "c 3"]:
+    """Return for each Gaussian the sum of the unit directions to the cameras that see its mean unhidden."""
+    sums = np.zeros((len(ids), 3))
+    if len(origins_world) == 0:
+        return sums
+    most = max(1, MAX_VISIBILITY_RAYS // len(origins_world))
+    for start in range(0, len(ids), most):
+        part = ids[start : start + most]
+        means = np.repeat(gaussians.means_world[part].astype(np.float64), len(origins_world), axis=0)
+        cameras = np.tile(origins_world, (len(part), 1))
+        lengths = np.linalg.norm(means - cameras, axis=1)
+        reach = np.repeat(np.exp(gaussians.log_scales[part].max(axis=1)), len(origins_world))
+        rays = RayBatch.between(cameras, means)
+        ends = np.maximum(lengths - np.maximum(VISIBILITY_GAP * lengths, reach), 0.0)
+        is_seen = (
+            tracer.transmittance(RayBatch(cameras, rays.directions_world, 0.0, ends)) >= VISIBLE_TRANSMITTANCE
+        )
+        towards = -rays.directions_world * is_seen[:, None]
+        sums[start : start + most] = towards.reshape(len(part), len(origins_world), 3).sum(
+            axis=1, dtype=np.float64
+        )
     return sums
 
 
