@@ -22,8 +22,8 @@ See :func:`octasplat.engine.train.sampling.batches.grid_pixels`.
 VIEWS_PER_TRACE = 8
 VISIBLE_TRANSMITTANCE = 0.5
 """A view sees a Gaussian where at least this much of the light between its mean and the camera gets through."""
-VISIBILITY_GAP = 0.003
-"""How far before the mean that way ends, of its length, or the larger scale of the Gaussian where that is more."""
+VISIBILITY_GAP = 0.005
+"""How far before the mean that way ends, as a share of its length: so much may a surface be uneven."""
 MAX_VISIBILITY_RAYS = 1 << 18
 """So many of these ways are traced at once."""
 
@@ -104,14 +104,10 @@ def _summed_directions_of_sight(
         part = ids[start : start + most]
         means = np.repeat(gaussians.means_world[part].astype(np.float64), len(origins_world), axis=0)
         cameras = np.tile(origins_world, (len(part), 1))
-        lengths = np.linalg.norm(means - cameras, axis=1)
-        reach = np.repeat(np.exp(gaussians.log_scales[part].max(axis=1)), len(origins_world))
-        rays = RayBatch.between(cameras, means)
-        ends = np.maximum(lengths - np.maximum(VISIBILITY_GAP * lengths, reach), 0.0)
-        is_seen = (
-            tracer.transmittance(RayBatch(cameras, rays.directions_world, 0.0, ends)) >= VISIBLE_TRANSMITTANCE
-        )
-        towards = -rays.directions_world * is_seen[:, None]
+        ways = RayBatch.between(cameras, means)
+        clear = RayBatch(cameras, ways.directions_world, 0.0, (1 - VISIBILITY_GAP) * ways.t_max)
+        is_seen = tracer.transmittance(clear) >= VISIBLE_TRANSMITTANCE
+        towards = -ways.directions_world * is_seen[:, None]
         sums[start : start + most] = towards.reshape(len(part), len(origins_world), 3).sum(
             axis=1, dtype=np.float64
         )
