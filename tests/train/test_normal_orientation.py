@@ -15,7 +15,7 @@ from tests.support.planar_dataset import PlanarDataset
 
 def test_normals_seen_from_behind_are_flipped() -> None:
     world = PlanarDataset()
-    gaussians = world.initial_gaussians(opacity=0.6)
+    gaussians = world.initial_gaussians(opacity=0.3)
     rng = np.random.default_rng(5)
     gaussians.quats_wxyz = rng.normal(size=(len(gaussians), 4)).astype(np.float32)
     before = gaussians.select(np.arange(len(gaussians)))

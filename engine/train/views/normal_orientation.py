@@ -21,7 +21,7 @@ See :func:`octasplat.engine.train.sampling.batches.grid_pixels`.
 """
 VIEWS_PER_TRACE = 8
 VISIBLE_TRANSMITTANCE = 0.5
-"""A view sees a Gaussian where at least this much of the light between its mean and the camera gets through."""
+"""A view sees a Gaussian to whose mean at least this much of the light from the camera gets through."""
 VISIBILITY_GAP = 0.005
 """How far before the mean that way ends, as a share of its length: so much may a surface be uneven."""
 MAX_VISIBILITY_RAYS = 1 << 18
