@@ -57,7 +57,7 @@ def orient_normals(
         )
     normals = gaussians.rotations[:, :, 0].astype(np.float64)
     candidates = np.flatnonzero((normals * towards).sum(axis=1) < 0).astype(np.int32)
-    towards_seen = _summed_directions_of_sight(gaussians, candidates, _view_origins(dataset, indices), tracer)
+    towards_seen = _summed_unhidden_directions(gaussians, candidates, _view_origins(dataset, indices), tracer)
     flipped_ids = candidates[(normals[candidates] * towards_seen).sum(axis=1) < 0]
     gaussians.quats_wxyz[flipped_ids] = _flip_frames(gaussians.quats_wxyz[flipped_ids])
     return flipped_ids
@@ -89,7 +89,7 @@ def _view_origins(dataset: TrainingData, indices: Int64[np.ndarray, " v"]) -> Fl
     return np.broadcast_to(origins, (len(indices), 3))
 
 
-def _summed_directions_of_sight(
+def _summed_unhidden_directions(
     gaussians: FlatGaussians,
     ids: Int32[np.ndarray, " c"],
     origins_world: Float64[np.ndarray, "v 3"],
