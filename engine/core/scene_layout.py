@@ -280,8 +280,8 @@ _SENTENCES = {
     "them into its images folder.",
     "video": "{count} videos are left out ({names}); save frames of them as photographs.",
     "archive": "{count} archives are left out ({names}); unpack them first.",
-    "poses": "{count} files hold poses that are not read ({names}); to use them, put them as a COLMAP model into "
-    "sparse/0.",
+    "poses": "{count} files hold poses that are not read ({names}); to use them, put them as a COLMAP "
+    "model into sparse/0.",
     "table": "{count} XMP and CSV files are left out ({names}); RealityScan (RealityCapture) poses in them "
     "are not read: to use them, export its registration as a COLMAP model into sparse/0.",
     "other": "{count} files are no part of a scene and are left out ({names}).",
