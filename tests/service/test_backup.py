@@ -14,6 +14,7 @@ from typing import Any
 import httpx
 import psycopg
 import pytest
+from psycopg.conninfo import make_conninfo
 
 from octasplat.service.state import Service
 from octasplat.workers.db.migrate import OWN_COMPONENT, all_migrations, migrate
@@ -176,15 +177,18 @@ def test_backup_of_an_earlier_version_is_restored(postgres: EmbeddedPostgres, tm
 
 def test_backup_beside_a_migration_is_repeated_after_a_deadlock(conninfo: str, tmp_path: Path) -> None:
     waiting_backup = "SELECT FROM pg_locks WHERE relation = 'artifacts'::regclass AND NOT granted"
+    # The side whose time is over first finds the deadlock and is the one that fails. It looks once, so the
+    # backup's time has to last until the other side waits, too.
+    patient = make_conninfo(conninfo, options="-c deadlock_timeout=5s")
     with ThreadPoolExecutor() as threads, psycopg.connect(conninfo) as changing:
+        changing.execute("SET deadlock_timeout = '120s'")
         changing.execute("ALTER TABLE artifacts ADD COLUMN later_a text NOT NULL DEFAULT 'a'")
         made = threads.submit(
-            create_backup, conninfo, LocalStorage(tmp_path / "store", floor_bytes=0), tmp_path / "backup"
+            create_backup, patient, LocalStorage(tmp_path / "store", floor_bytes=0), tmp_path / "backup"
         )
         while changing.execute(waiting_backup).fetchone() is None:
             assert not made.done(), made.result()
             time.sleep(0.01)
-        # The backup has waited longer, so that the deadlock is found on its side.
         changing.execute("ALTER TABLE datasets ADD COLUMN later_d text NOT NULL DEFAULT 'd'")
         changing.commit()
         made.result()
