@@ -118,7 +118,8 @@ def _polish(
 
     fixed = select_into_files(merged, ~is_near_cut, work.folder)
     piece = Piece(POLISH, data, config, start, fixed, is_fixed_in_files=True, keeps_near_free=False)
-    polished = train_piece(work, piece, tell.of_piece(POLISH))
+    progress = tell.of_piece(POLISH, other_gaussians=len(fixed))
+    polished = train_piece(work, piece, progress)
     merged.put(is_near_cut, polished.gaussians)
     return merged
 

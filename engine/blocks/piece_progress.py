@@ -34,8 +34,13 @@ class PieceProgress:
         """Return the iterations of all pieces."""
         return sum(self._iterations.values())
 
-    def of_piece(self, name: str) -> EventListener:
-        """Return the listener of one piece."""
+    def of_piece(self, name: str, *, other_gaussians: int = 0) -> EventListener:
+        """Return the listener of one piece.
+
+        Args:
+            name: of the piece.
+            other_gaussians: of the whole scene, those that the piece does not train; told with its own.
+        """
 
         def listen(event: Event) -> None:
             if isinstance(event, HeldOutMeasured):
@@ -48,6 +53,7 @@ class PieceProgress:
                 )
             if isinstance(event, TrainingProgress):
                 event = self._translate(name, event)
+                event = replace(event, gaussians=event.gaussians + other_gaussians)
             elif isinstance(event, CheckpointWritten):
                 event = replace(event, iteration=self._iterations_before(name) + event.iteration)
             self._progress(event)

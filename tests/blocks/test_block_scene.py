@@ -128,6 +128,9 @@ def test_merged_scene_numbers_one_core_after_the_other(scene: Path, polished_blo
     assert list(record["pieces"]) == ["coarse", "block_001", "block_002", "polish"]
     assert record["iterations"] == 150 + 300 * 2 + 30
     merged, _ = read_gaussian_ply(run / "scene.ply")
+    told = [json.loads(row) for row in (run / "events.jsonl").read_text().splitlines()]
+    last = [row for row in told if row["kind"] == TrainingProgress.kind][-1]
+    assert last["gaussians"] == len(merged)  # not only those that the polish has trained
     dataset = Dataset.open(scene, run / "cache", test_every=4)
     coarse = load_best(run / "blocks" / "coarse").gaussians
     tracer = make_tracer(make_config().train.trace, threads=1)
