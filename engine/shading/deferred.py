@@ -317,7 +317,7 @@ class DeferredShading:
             traced.result,
             traced.tracer,
             min_separation_world=self.settings.depth_split * self._ray_bias_world,
-            record_for_backward=traced.view is not None,  # only rays of a training batch have a view
+            record_for_backward=traced.is_recorded,
         )
 
     def _surface_with_ambient(self, result: TraceResult, gbuffer: GBuffer) -> SurfacePoints:

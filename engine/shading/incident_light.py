@@ -82,7 +82,7 @@ class RayPairIncidentLight:
         settings: MaterialSettings,
     ) -> "RayPairIncidentLight":
         """Trace pairs of rays for the points of a G-buffer."""
-        rays, record, directions = split.rays, traced.view is not None, gbuffer.surface.direction_world
+        rays, record, directions = split.rays, traced.is_recorded, gbuffer.surface.direction_world
         salt, min_slope = (
             int(traced.training_progress * PROGRESS_SALTS),
             settings.min_facet_slope(traced.training_progress),
@@ -151,7 +151,7 @@ class SingleRayIncidentLight:
     ) -> "SingleRayIncidentLight":
         """Trace one ray for each point of a G-buffer."""
         rays = reflected_rays(split.rays, gbuffer, offset)
-        result = traced.tracer.trace(rays, record=traced.view is not None)
+        result = traced.tracer.trace(rays, record=traced.is_recorded)
         visibility = result.transmittance.astype(np.float64)
         if settings.indirect == "none":
             return cls(IncidentLight(visibility, np.zeros((len(rays), 3))))

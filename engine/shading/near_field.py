@@ -165,7 +165,7 @@ class NearFieldShading(DeferredShading):
         """Return which points send reflected rays."""
         surface = gbuffer.surface
         reflects = surface.material[:, METALLIC_COLUMN] > MIN_REFLECTING_SHARE
-        if traced.view is not None:
+        if traced.is_recorded:  # in a training
             salt = int(traced.training_progress * PROGRESS_SALTS) + 2  # other numbers than the facets'
             reflects |= direction_uniforms(surface.direction_world, salt)[0] < PROBED_FRACTION
         return reflects

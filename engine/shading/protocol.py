@@ -46,6 +46,11 @@ class TracedRays:
     dither: Float64[np.ndarray, "2 r"] | None = None
     ray_patches: RayPatches | None = None
 
+    @property
+    def is_recorded(self) -> bool:
+        """Return whether a backward pass may follow: what was traced is recorded."""
+        return self.result.recording is not None
+
 
 @dataclass(frozen=True)
 class ShadedRays:

@@ -129,7 +129,7 @@ class RefGaussianShading(DeferredShading):
     def _trace_incident(self, traced: TracedRays, split: DepthLayers, gbuffer: GBuffer) -> IncidentLightModel:
         """Trace one mirrored ray a point, which hits harmonics in display values or nothing."""
         rays = reflected_rays(split.rays, gbuffer, self._reflection_offset)
-        result = traced.tracer.trace(rays.with_t_max(RAY_LENGTH), record=traced.view is not None)
+        result = traced.tracer.trace(rays.with_t_max(RAY_LENGTH), record=traced.is_recorded)
         # yes or no, as the published code traces a mesh
         visibility = (result.transmittance > HIDDEN_TRANSMITTANCE).astype(np.float64)
         if self.settings.indirect == "none":

@@ -17,7 +17,7 @@ from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.shading.protocol import ShadedRayGradients, TracedRays
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.gradient_sums import add_gradients
-from octasplat.engine.trace.protocol import TraceSettings
+from octasplat.engine.trace.protocol import TraceResult, TraceSettings
 from octasplat.engine.train.initialization.initial_gaussians import add_initial_materials
 from octasplat.engine.train.loop.iteration import loss_and_gradients
 from octasplat.engine.train.loop.state import TrainState, initial_state
@@ -212,6 +212,34 @@ def test_deferred_mirror_reflects_gaussians_and_environment() -> None:
         shown = model.shade(TracedRays(rays, tracer.trace(rays), tracer)).rgb_srgb[0]
         linear = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
         np.testing.assert_allclose(linear, expected, atol=0.012)
+
+
+class CountingTracer(CpuTracer):
+    """A tracer that counts the rays that it records."""
+
+    recorded_rays = 0
+
+    def trace(self, rays: RayBatch, *, record: bool = False) -> TraceResult:
+        self.recorded_rays += len(rays) if record else 0
+        return super().trace(rays, record=record)
+
+
+def test_views_that_are_only_measured_record_no_reflected_rays() -> None:
+    """Recordings take memory for each hit, and a grid over all training views has many rays."""
+    mirrors = concatenate(
+        [wall((0, 0, 1), floor(1.0, 0.1, above=above), [1, 1, 1, 1, 0.3]) for above in (0.0, 1.0)]
+    )
+    settings = MaterialSettings(**{**BARE, "roughness_probe_fraction": 1.0}, up_world=(0, 0, 1))
+    model = DeferredShading(settings, extent_world=1.0)
+    model.light.set_radiance(np.full((16, 32, 3), 0.5, np.float32))
+    rays = RayBatch(np.tile([[0, 0, 0.5]], (8, 1)), np.tile([[0.0, 0.6, -0.8]], (8, 1)))
+    tracer, views = CountingTracer(threads=1), np.zeros(8, np.int64)
+    tracer.build(mirrors, model.features(mirrors))
+    measured = model.shade(TracedRays(rays, tracer.trace(rays), tracer, views))
+    assert tracer.recorded_rays == 0
+    learnt = model.shade(TracedRays(rays, tracer.trace(rays, record=True), tracer, views))
+    assert tracer.recorded_rays > 3 * 8  # two from each point, and on from the other mirror
+    np.testing.assert_array_equal(measured.rgb_srgb, learnt.rgb_srgb)
 
 
 def test_deferred_reflection_rays_skip_own_surface() -> None:
