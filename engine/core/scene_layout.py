@@ -273,9 +273,7 @@ def too_few_photographs(count: int) -> str | None:
     return f"There are {count} photographs; at least {MIN_PHOTOGRAPHS} are needed ({formats})."
 
 
-def left_out_sentences(
-    paths: Sequence[str], without_poses: Collection[str] = frozenset()
-) -> tuple[str, ...]:
+def left_out_sentences(paths: Sequence[str], without_poses: Collection[str] = frozenset()) -> tuple[str, ...]:
     """Return what to say of files that are left out: how many of each kind, which, and the way out.
 
     Args:
