@@ -297,7 +297,9 @@ def test_settings_of_a_photo_editor_beside_photographs_are_not_told_as_poses(tmp
 
 
 def test_sidecars_named_after_the_whole_name_of_a_photograph_are_not_told_as_poses() -> None:
-    layout = lay_out_scene(["images/a.jpg", "images/a.jpg.xmp", "images/b.NEF.xmp"])  # as darktable names them
+    layout = lay_out_scene(
+        ["images/a.jpg", "images/a.jpg.xmp", "images/b.NEF.xmp"]
+    )  # as darktable names them
     assert not any("RealityScan" in sentence for sentence in layout.notes) and len(layout.notes) == 1
 
 

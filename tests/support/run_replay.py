@@ -79,7 +79,7 @@ class RunReplay:
         asyncio.run(self._tell(job_id, row, [("progress", told)]))
 
     def begin_stage(self, job_id: uuid.UUID, former: str, stage: str, *, seconds: float, steps: int) -> None:
-        """Tell of a job that was left running that a stage has ended after ``seconds``, and the next begins."""
+        """Tell of a job that was left running that a stage has ended, and the next begins."""
         finished = ("stage_finished", {"stage": former, "seconds": seconds})
         started = ("stage_started", {"stage": stage, "total_steps": steps})
         asyncio.run(self._tell(job_id, (stage, 0, steps, None), [finished, started]))

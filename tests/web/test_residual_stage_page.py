@@ -24,8 +24,8 @@ SECONDS_AFTER = 70.0
 def trained(iteration: int, seconds_left: float) -> dict[str, Any]:
     """The state of a training after ``iteration`` of 60; ``seconds_left`` holds the fit."""
     return {
-        "kind": "training_progress", "iteration": iteration, "total_iterations": 60, "loss": 0.1, "psnr": 20.0,
-        "gaussians": 300, "rays_per_second": 1e4, "hits_per_ray": 9.0, "seconds": 3.0,
+        "kind": "training_progress", "iteration": iteration, "total_iterations": 60, "loss": 0.1,
+        "psnr": 20.0, "gaussians": 300, "rays_per_second": 1e4, "hits_per_ray": 9.0, "seconds": 3.0,
         "seconds_left": seconds_left, "seconds_after": SECONDS_AFTER,
     }  # fmt: skip
 
