@@ -136,7 +136,7 @@ def fit_residual_colors(
             progress(iteration, iterations)
         if should_stop():
             raise CancelledError(
-                "Stopped while residual colors were fitted; the same command with --resume goes on."
+                "Stopped while fitting residual colors; the same command with --resume goes on."
             )
         if iteration % ITERATIONS_PER_BATCH == 0:
             batch = source.draw(rng, iteration // ITERATIONS_PER_BATCH)
