@@ -53,14 +53,14 @@ def photographs_of_scene(scene: Path) -> list[str]:
         (scene / path).relative_to(folder).as_posix() for name, path in images.items() if name not in masks
     )
     if (fault := too_few_photographs(len(names))) is not None:
-        raise DatasetError(" ".join((f"{scene}: {fault}", *_told_layout(scene).notes)))
+        raise DatasetError(" ".join((f"{scene}: {fault}", *_layout_with_sidecars(scene).notes)))
     return names
 
 
 def notes_on_files(scene: Path) -> tuple[str, ...]:
     """Return sentences on the files of a folder that are left out, or bear names that others refuse."""
     unreadable: list[Path] = []
-    layout = _told_layout(scene, unreadable.append)
+    layout = _layout_with_sidecars(scene, unreadable.append)
     others = unreadable_folders_sentence(unreadable, scene), unportable_names_sentence(layout.files)
     return (*layout.notes, *(sentence for sentence in others if sentence is not None))
 
@@ -78,8 +78,10 @@ def _layout_of(scene: Path) -> SceneLayout:
     return lay_out_scene(_files_below(scene))
 
 
-def _told_layout(scene: Path, on_unreadable: Callable[[Path], None] = lambda _folder: None) -> SceneLayout:
-    """Return the layout whose notes are told: what XMP files hold is looked at."""
+def _layout_with_sidecars(
+    scene: Path, on_unreadable: Callable[[Path], None] = lambda _folder: None
+) -> SceneLayout:
+    """Return the layout, with notes that know what XMP files hold."""
     files = _files_below(scene, on_unreadable)
     return lay_out_scene(files, lambda path: _holds_poses(scene / path))
 
