@@ -163,7 +163,8 @@ def origin_after(
     chosen = choose_origin(centre + carried, extent)
     if extent == 0.0:  # of points in one place only their size says whether their coordinates are large
         chosen = choose_origin_of_place(centre + carried, size)
-        is_far = is_set(origin) and np.linalg.norm(carried) > MAX_DISTANCE * np.linalg.norm(centre)
+        was_far = is_set(origin) and np.linalg.norm(carried) > MAX_DISTANCE * np.linalg.norm(centre)
+        is_far = was_far and (size == 0.0 or is_set(chosen))
     else:
         is_far = is_set(chosen) and is_set(origin) and np.linalg.norm(centre) <= MAX_DISTANCE * extent
     if is_far:

@@ -85,6 +85,10 @@ class ProgressCallback(Protocol):
         """
 
 
+def no_progress(done: int, total: int, part: float = 0.0) -> None:
+    """Receive progress that nobody wants to know of."""
+
+
 @contextmanager
 def counted_phase(name: str, progress: EventListener, steps: int = 0) -> Iterator[ProgressCallback]:
     """Run a phase that counts its steps; yields its progress callback."""

@@ -16,7 +16,7 @@ gcp_list.txt, control_points.csv    ground control points, see :mod:`octasplat.e
 """
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import PurePosixPath
@@ -30,6 +30,7 @@ UNREAD_SUFFIXES = frozenset(
     | {".orf", ".rw2", ".pef", ".srw", ".raw", ".insp", ".ppm", ".pgm", ".tga", ".dpx", ".psd", ".j2k"}
 )
 """Photographs in formats that are not taken."""
+_PHOTOGRAPH_SUFFIXES = IMAGE_SUFFIXES | UNREAD_SUFFIXES
 ARCHIVE_SUFFIXES = frozenset({".zip", ".7z", ".rar", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".zst"})
 VIDEO_SUFFIXES = frozenset({".mov", ".mp4", ".m4v", ".avi", ".mkv", ".mts", ".webm", ".insv", ".360"})
 IMAGES = "images/"
@@ -61,6 +62,8 @@ _POSES_OF_OTHERS = re.compile(
 )
 # RealityScan, formerly RealityCapture, writes poses to both; so do others for other ends.
 _TABLE_SUFFIXES = frozenset({".xmp", ".csv"})
+SIDECAR_SUFFIX = ".xmp"
+"""Of files beside photographs: with poses by RealityScan, with settings by programs that develop them."""
 # "Icon\r" is the icon of a folder on macOS; "." and ".." are not hidden files.
 _IGNORED_FILE = re.compile(
     r"(^|/)(__MACOSX/|\.(?!\.?(/|$))[^/]*|thumbs\.db$|desktop\.ini$|Icon\r?$)", re.IGNORECASE
@@ -110,21 +113,30 @@ class SceneLayout:
         ignored: paths of what file managers leave behind, of hidden files, and of the ground truth of a
             generated scene.
         folder: the folder, with its slash, that is around everything; empty where there is none.
+        without_poses: paths of files left out that might hold poses by their names and do not.
     """
 
     files: Mapping[str, str]
     left_out: tuple[str, ...]
     ignored: tuple[str, ...]
     folder: str
+    without_poses: frozenset[str] = frozenset()
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Sentences on what is left out, with names relative to the folder around everything."""
-        return left_out_sentences(sorted(path.removeprefix(self.folder) for path in self.left_out))
+        names = sorted(path.removeprefix(self.folder) for path in self.left_out)
+        return left_out_sentences(names, {path.removeprefix(self.folder) for path in self.without_poses})
 
 
-def lay_out_scene(paths: Sequence[str]) -> SceneLayout:
+def lay_out_scene(
+    paths: Sequence[str], holds_poses: Callable[[str], bool] = lambda _path: True
+) -> SceneLayout:
     """Return which of the files below a folder, or in an archive, make up a scene.
+
+    Args:
+        paths: of the files.
+        holds_poses: whether an XMP file has poses in it, where that can be told.
 
     >>> lay_out_scene(["DCIM/100MEDIA/a.JPG", "DCIM/100MEDIA/a.MOV"]).files
     {'images/a.JPG': 'DCIM/100MEDIA/a.JPG'}
@@ -147,7 +159,10 @@ def lay_out_scene(paths: Sequence[str]) -> SceneLayout:
         elif name.startswith(top) and name in photographs:
             files[f"images/{name.removeprefix(top)}"] = path
     taken = set(files.values())
-    return SceneLayout(files, tuple(path for path in rest if path not in taken), ignored, folder)
+    left_out = tuple(path for path in rest if path not in taken)
+    sidecars = (path for path in left_out if PurePosixPath(path).suffix.lower() == SIDECAR_SUFFIX)
+    without_poses = frozenset(path for path in sidecars if not holds_poses(path))
+    return SceneLayout(files, left_out, ignored, folder, without_poses)
 
 
 def _unused_model_files(names: Iterable[str]) -> set[str]:
@@ -258,12 +273,18 @@ def too_few_photographs(count: int) -> str | None:
     return f"There are {count} photographs; at least {MIN_PHOTOGRAPHS} are needed ({formats})."
 
 
-def left_out_sentences(paths: Sequence[str]) -> tuple[str, ...]:
-    """Return what to say of files that are left out: how many of each kind, which, and the way out."""
+def left_out_sentences(paths: Sequence[str], without_poses: Collection[str] = frozenset()) -> tuple[str, ...]:
+    """Return what to say of files that are left out: how many of each kind, which, and the way out.
+
+    Args:
+        paths: of the files.
+        without_poses: those that might hold poses by their names and do not.
+    """
     kinds: dict[str, list[str]] = {}
     results = ("",) if is_results_folder(paths) else results_folders(paths)
     for path in paths:
         kind = "results" if path.startswith(results) else _kind_of(path)
+        kind = "other" if kind == "table" and path in without_poses else kind
         kinds.setdefault(kind, []).append(path)
     return tuple(
         sentence.format(count=len(kinds[kind]), names=name_list(kinds[kind]))
@@ -282,8 +303,9 @@ _SENTENCES = {
     "archive": "{count} archives are left out ({names}); unpack them first.",
     "poses": "{count} files hold poses that are not read ({names}); to use them, put them as a COLMAP "
     "model into sparse/0.",
-    "table": "{count} XMP and CSV files are left out ({names}); RealityScan (RealityCapture) poses in them "
-    "are not read: to use them, export its registration as a COLMAP model into sparse/0.",
+    "table": "{count} XMP and CSV files are left out ({names}); if they hold poses of RealityScan "
+    "(RealityCapture), these are not read: to use them, export its registration as a COLMAP model into "
+    "sparse/0.",
     "other": "{count} files are no part of a scene and are left out ({names}).",
 }
 
@@ -300,7 +322,9 @@ def _kind_of(path: str) -> str:
     if suffix in ARCHIVE_SUFFIXES:
         return "archive"
     if suffix in _TABLE_SUFFIXES:
-        return "table"
+        # after the whole name of a photograph, as darktable names them: RealityScan leaves its suffix out
+        is_edit = suffix == SIDECAR_SUFFIX and PurePosixPath(pure.stem).suffix.lower() in _PHOTOGRAPH_SUFFIXES
+        return "other" if is_edit else "table"
     is_transforms = pure.name.startswith("transforms") and suffix == ".json"
     is_poses = is_transforms or _MODEL_ELSEWHERE.fullmatch(path) or _POSES_OF_OTHERS.fullmatch(path)
     return "poses" if is_poses else "other"

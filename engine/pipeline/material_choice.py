@@ -9,7 +9,12 @@ from octasplat.engine.core.events import Noted, Warned
 from octasplat.engine.pipeline.output_folder import other_settings_error, write_config
 from octasplat.engine.pipeline.run import ReconstructionRun
 from octasplat.engine.pipeline.start_scene import has_start
-from octasplat.engine.runs.config import ReconstructionConfig, read_given, revise_config
+from octasplat.engine.runs.config import (
+    ReconstructionConfig,
+    read_given,
+    revise_config,
+    without_later_settings,
+)
 from octasplat.engine.runs.run_folder import CONFIG
 from octasplat.engine.settings.refusals import InvalidSettingsError
 from octasplat.engine.shading.material_settings import Recipe
@@ -67,6 +72,9 @@ def with_recorded_choice(
 ) -> tuple[ReconstructionConfig, tuple[str, ...] | None]:
     """Return the settings of a command with what the run in a folder has chosen, if it is there and has.
 
+    Settings that the version of the run did not have, and that the command does not name, stay as without
+    them.
+
     Args:
         output: the folder.
         config: as the command gives it; the run's own settings have the choice already.
@@ -82,6 +90,7 @@ def with_recorded_choice(
     if not (output / CONFIG).exists():
         return config, given
     recorded = read_given(output / CONFIG)
+    config = without_later_settings(config, output / CONFIG, {*(given or ()), *(recorded or ())})
     if _asks_for_choice(config):
         # a run of old does not know what it was given, and goes on as it was begun
         of_command = recorded if given is None or recorded is None else given

@@ -161,8 +161,8 @@ def _check_settings(scene: Path, output: Path, config: ReconstructionConfig) -> 
 def other_settings_error(output: Path) -> ConfigError:
     """Return what to say of a command whose settings are not those of the run in a folder."""
     return ConfigError(
-        f"{output / CONFIG} has other settings than this command; repeat the settings of the run, or name "
-        "another folder."
+        f"{output / CONFIG} has other settings than this command; without any option --resume takes those of "
+        "the run. Or name another folder."
     )
 
 

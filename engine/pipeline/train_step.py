@@ -125,7 +125,8 @@ class TrainStep:
                 trained.write(run, clock.stop())
         if fits:  # its own stage: what was trained is in a checkpoint, and the scene is there after both
             began = time.perf_counter()
-            with counted_phase("residual", run.progress, fits) as count_steps:
+            steps = fits + trained.trainer.measured_view_count
+            with counted_phase("residual", run.progress, steps) as count_steps:
                 _fit_residual(run, trained.trainer, trained.gaussians, fits, count_steps)
                 seconds = clock.seconds() + time.perf_counter() - began
                 trained.write(run, seconds, residual_iterations=fits)
@@ -192,19 +193,22 @@ def _fit_residual(
     iterations: int,
     progress: ProgressCallback,
 ) -> None:
-    """Fit and write residual colors after a training with materials."""
-    config = trainer.config
+    """Fit and write residual colors after a training with materials, and measure the views with them."""
+    config, steps = trainer.config, iterations + trainer.measured_view_count
     residual_sh = fit_residual_colors(
         gaussians, trainer.dataset, trainer.shading, config,
         iterations=iterations, excluded_views=trainer.state.excluded_views, threads=run.threads,
-        should_stop=run.should_stop, progress=progress,
+        should_stop=run.should_stop, progress=lambda done, _total, _part=0.0: progress(done, steps),
     )  # fmt: skip
     write_residual(run.output, gaussians, residual_sh)
     materials = find_deferred(trainer.shading)
     assert materials is not None, "materials are learnt"
     tracer = make_tracer(config.trace, threads=run.threads)
     residual = ResidualColors(materials, gaussians, residual_sh, tracer)
-    trainer.measure_views_again(add_residual(trainer.shading, residual))
+    trainer.measure_views_again(
+        add_residual(trainer.shading, residual),
+        lambda done, _total, _part=0.0: progress(iterations + done, steps),
+    )
 
 
 def _train_in_blocks(run: ReconstructionRun, count: int) -> FlatGaussians:

@@ -19,6 +19,10 @@ from octasplat.engine.dataset.model_sources import has_model
 from octasplat.engine.dataset.photograph_files import image_folder, no_folder_sentence
 from octasplat.engine.dataset.results_among import is_run_folder
 
+_POSE_PROPERTIES = (b"xcr:Rotation", b"xcr:Position")
+"""Of the XMP files in which RealityScan, formerly RealityCapture, keeps poses."""
+_MAX_SIDECAR_BYTES = 1 << 20
+
 
 def locate_scene(folder: Path) -> Path:
     """Return the scene that ``folder`` is, or the one below it where there is nothing beside that.
@@ -49,14 +53,14 @@ def photographs_of_scene(scene: Path) -> list[str]:
         (scene / path).relative_to(folder).as_posix() for name, path in images.items() if name not in masks
     )
     if (fault := too_few_photographs(len(names))) is not None:
-        raise DatasetError(" ".join((f"{scene}: {fault}", *layout.notes)))
+        raise DatasetError(" ".join((f"{scene}: {fault}", *_layout_with_sidecars(scene).notes)))
     return names
 
 
 def notes_on_files(scene: Path) -> tuple[str, ...]:
     """Return sentences on the files of a folder that are left out, or bear names that others refuse."""
     unreadable: list[Path] = []
-    layout = lay_out_scene(_files_below(scene, unreadable.append))
+    layout = _layout_with_sidecars(scene, unreadable.append)
     others = unreadable_folders_sentence(unreadable, scene), unportable_names_sentence(layout.files)
     return (*layout.notes, *(sentence for sentence in others if sentence is not None))
 
@@ -72,6 +76,24 @@ def _check_folder(scene: Path) -> None:
 
 def _layout_of(scene: Path) -> SceneLayout:
     return lay_out_scene(_files_below(scene))
+
+
+def _layout_with_sidecars(
+    scene: Path, on_unreadable: Callable[[Path], None] = lambda _folder: None
+) -> SceneLayout:
+    """Return the layout, with notes that know what XMP files hold."""
+    files = _files_below(scene, on_unreadable)
+    return lay_out_scene(files, lambda path: _holds_poses(scene / path))
+
+
+def _holds_poses(sidecar: Path) -> bool:
+    """Return whether an XMP file beside a photograph holds a pose, as those of RealityScan do."""
+    try:
+        with sidecar.open("rb") as file:
+            content = file.read(_MAX_SIDECAR_BYTES)
+    except OSError:
+        return False
+    return any(name in content for name in _POSE_PROPERTIES)
 
 
 def _files_below(folder: Path, on_unreadable: Callable[[Path], None] = lambda _folder: None) -> list[str]:

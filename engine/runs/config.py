@@ -4,7 +4,7 @@ Imports neither torch nor numba.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -14,6 +14,7 @@ from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.poses.found_models import parse_found_model
 from octasplat.engine.runs.run_settings import RunSettings
 from octasplat.engine.runs.setting_names import check_names, leaf_paths, named_values, value_at
+from octasplat.engine.settings.base import Settings
 from octasplat.engine.settings.fields import ADVANCED
 from octasplat.engine.settings.nested_options import merge_options
 from octasplat.engine.settings.preset_names import PRESETS, PRESETS_WITH_MATERIALS
@@ -277,6 +278,37 @@ def read_config(path: Path) -> ReconstructionConfig:
         raise ConfigError(
             f"{path} cannot be read ({reason}); name the folder of a finished or stopped run."
         ) from None
+
+
+def without_later_settings(
+    config: ReconstructionConfig, path: Path, given: Collection[str]
+) -> ReconstructionConfig:
+    """Return settings without those that the version of a run did not have; None stands for that.
+
+    Args:
+        config: the settings.
+        path: ``config.json`` of the run; a file that cannot be read is told by whoever needs it.
+        given: names of settings that stay, as somebody asked for them.
+    """
+    try:
+        recorded = json.loads(path.read_text(encoding="utf-8"))["reconstruction"]["train"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return config
+    return config.model_copy(update={"train": _without_later(config.train, recorded, given, "")})
+
+
+def _without_later(settings: Settings, recorded: object, given: Collection[str], prefix: str) -> Settings:
+    """Return a section of settings, whose names begin with ``prefix``, without those not recorded."""
+    if not isinstance(recorded, Mapping):
+        return settings
+    changes: dict[str, object] = {}
+    for name in type(settings).model_fields:
+        value, path = getattr(settings, name), f"{prefix}{name}"
+        if isinstance(value, Settings):
+            changes[name] = _without_later(value, recorded.get(name), given, f"{path}.")
+        elif name in settings.later_settings and recorded.get(name) is None and path not in given:
+            changes[name] = None
+    return settings.model_copy(update=changes)
 
 
 def _collect_changes(

@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from octasplat.engine.core.errors import CancelledError, ConfigError
-from octasplat.engine.core.events import Event, EventListener, PhaseProgress, TrainingProgress
+from octasplat.engine.core.events import (
+    Event,
+    EventListener,
+    PhaseProgress,
+    TrainingProgress,
+    parse_event,
+    read_events,
+)
 from octasplat.notebook import default_progress, table_html
 from octasplat.operation_calls import explicit_values, run_operation
 from octasplat.paths import PathLike
@@ -19,8 +26,8 @@ from octasplat.scenes import Scene, load
 if TYPE_CHECKING:
     from octasplat.engine.render.pinhole_camera import PinholeCamera
 
-_CONFIG, _EDITS, _METRICS, _REPORT, _SCENE, _TRAINING = (
-    "config.json", "edits.json", "metrics.json", "report.html", "scene.ply", "training.json",
+_CONFIG, _EDITS, _EVENTS, _METRICS, _REPORT, _SCENE, _TRAINING = (
+    "config.json", "edits.json", "events.jsonl", "metrics.json", "report.html", "scene.ply", "training.json",
 )  # fmt: skip
 OnStep = Callable[[TrainingProgress], bool | None]
 """Called with the state of the training every few iterations; returning False stops it.
@@ -62,9 +69,11 @@ def reconstruct_run(
         listener(event)
         if isinstance(event, TrainingProgress):
             trained = event
-        elif trained is not None and isinstance(event, PhaseProgress) and event.stage == "residual":
-            left = (1 - event.step / event.total_steps) * trained.seconds_after
-            event = replace(trained, seconds_left=left, seconds_after=left)
+        elif isinstance(event, PhaseProgress) and event.stage == "residual":
+            trained = trained or _last_of_training(Path(values["output"]))
+            if trained is not None:
+                left = (1 - event.step / event.total_steps) * trained.seconds_after
+                event = replace(trained, seconds_left=left, seconds_after=left)
         if on_step is not None and isinstance(event, TrainingProgress) and on_step(event) is False:
             # It ends at the next safe point, where should_stop is asked.
             stopped = True
@@ -76,6 +85,15 @@ def reconstruct_run(
         if not stopped:
             raise
     return Run(values["output"])
+
+
+def _last_of_training(output: Path) -> TrainingProgress | None:
+    """Return the last state of its training that a run has told; None where it has told none."""
+    for row in reversed(read_events(output / _EVENTS)):
+        if row.get("kind") == TrainingProgress.kind:
+            event = parse_event(TrainingProgress.kind, row)
+            return event if isinstance(event, TrainingProgress) else None
+    return None
 
 
 class Run:

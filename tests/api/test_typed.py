@@ -1,5 +1,6 @@
 """A user's program is checked as strictly as they like."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -8,6 +9,7 @@ import pytest
 from platformdirs import user_cache_path
 
 PROGRAM = Path(__file__).with_name("user_program.py")
+PAGE = Path(__file__).parents[2] / "docs" / "python.md"
 WRONG = """
 import octasplat as osp
 
@@ -36,6 +38,25 @@ def check(program: Path, folder: Path) -> tuple[int, str]:
     ]  # fmt: skip
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     return done.returncode, done.stdout
+
+
+def examples(page: Path) -> str:
+    """The examples of a page, one after the other, as one program without what they print."""
+    found = []
+    for block in re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL):
+        lines = block.splitlines()
+        if block.startswith(">>>"):
+            lines = [line[4:] for line in lines if line.startswith((">>> ", "... "))]
+        found += [*lines, ""]
+    return "\n".join(found)
+
+
+@pytest.mark.exhaustive
+def test_examples_of_the_page_on_python_pass_mypy_strict(tmp_path: Path) -> None:
+    program = tmp_path / "examples.py"
+    program.write_text(examples(PAGE))
+    assert len(program.read_text().splitlines()) > 40
+    assert check(program, tmp_path) == (0, "Success: no issues found in 1 source file\n")
 
 
 @pytest.mark.exhaustive

@@ -35,7 +35,12 @@ def test_fit_is_a_stage_with_progress_and_time(whole):
     finished = {row["stage"]: row["seconds"] for row in found if row["kind"] == "stage_finished"}
     assert list(finished) == ["load", "train", "residual", "evaluate", "export"]
     steps = [row["step"] for row in found if row["kind"] == "stage_progress" and row["stage"] == "residual"]
-    assert steps[0] == 0 and steps[-1] == 600 and steps == sorted(steps)
+    assert steps[0] == 0 and steps == sorted(steps)
+    # the views are measured with what was fitted
+    views = len(json.loads((output / "views.json").read_text())["views"])
+    assert 600 in steps and steps[-1] == 600 + views
+    [started] = [row for row in found if row["kind"] == "stage_started" and row["stage"] == "residual"]
+    assert started["total_steps"] == 600 + views
     record = json.loads((output / "training.json").read_text())
     assert record["seconds"] == pytest.approx(finished["train"] + finished["residual"], abs=1)
     assert ">residual <" in (output / "report.html").read_text()
@@ -64,12 +69,13 @@ def test_run_that_ends_in_the_fit_resumes_to_the_same_bytes(how, whole, scene, o
         if told.exists() and '"stage": "residual", "step": 1' in told.read_text():
             break
         time.sleep(0.02)
-    began = time.monotonic()
     running.send_signal(how)
     _, errors = running.communicate(timeout=120)
-    assert time.monotonic() - began < 5 and running.returncode != 0
+    assert running.returncode != 0
+    fitted = [row for row in rows(output) if row["kind"] == "stage_progress" and row["stage"] == "residual"]
+    assert fitted[-1]["step"] < 500
     if how == signal.SIGINT:
-        assert "while residual colors were fitted" in " ".join(errors.split())
+        assert "while fitting residual colors" in " ".join(errors.split())
     assert not (output / "scene.ply").exists()
     result = octasplat(*command, "--resume")
     assert result.exit_code == 0, result.output
@@ -98,5 +104,10 @@ def test_callback_is_called_and_stops_in_the_fit(scene, tmp_path):
         scene, tmp_path / "run", preset="fast", materials=True, train=train, exports=(), threads=1,
         on_step=on_step, progress=listen,
     )  # fmt: skip
+    assert not run.is_finished and stages[-1] == "residual"
+    assert called[-1].iteration == 60 and called[-1].seconds_left == called[-1].seconds_after > 0
+    stages.clear()
+    called.clear()  # the training is done, so that it tells nothing any more
+    run = osp.reconstruct(scene, run, resume=True, threads=1, on_step=on_step, progress=listen)
     assert not run.is_finished and stages[-1] == "residual"
     assert called[-1].iteration == 60 and called[-1].seconds_left == called[-1].seconds_after > 0

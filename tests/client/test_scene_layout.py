@@ -272,6 +272,37 @@ def test_poses_of_reality_scan_are_told_with_the_way_out() -> None:
     assert "(notes.json)" in told[1]
 
 
+LIGHTROOM = (
+    '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description xmlns:crs="http://ns.adobe.com/camera-raw-settings'
+    '/1.0/" crs:Exposure2012="+0.35" crs:Temperature="5200"/></x:xmpmeta>'
+)
+REALITY_SCAN = (
+    '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description xcr:Version="3" xcr:PosePrior="initial" '
+    'xmlns:xcr="http://www.capturingreality.com/ns/xcr/1.1#"><xcr:Rotation>1 0 0 0 1 0 0 0 1</xcr:Rotation>'
+    "<xcr:Position>0 0 -2</xcr:Position></rdf:Description></x:xmpmeta>"
+)
+
+
+def test_settings_of_a_photo_editor_beside_photographs_are_not_told_as_poses(tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    for name, content in (("a", LIGHTROOM), ("b", LIGHTROOM), ("c", REALITY_SCAN)):
+        (tmp_path / "images" / f"{name}.jpg").write_bytes(b"")
+        (tmp_path / "images" / f"{name}.xmp").write_text(content)
+    poses, other = notes_on_files(tmp_path)
+    assert poses.startswith("1 XMP and CSV files are left out (images/c.xmp)") and "RealityScan" in poses
+    assert other.startswith("2 files are no part of a scene") and "images/a.xmp, images/b.xmp" in other
+    assert "RealityScan" not in other
+    (tmp_path / "images" / "c.xmp").unlink()
+    assert not any("RealityScan" in sentence for sentence in notes_on_files(tmp_path))
+
+
+def test_sidecars_named_after_the_whole_name_of_a_photograph_are_not_told_as_poses() -> None:
+    layout = lay_out_scene(
+        ["images/a.jpg", "images/a.jpg.xmp", "images/b.NEF.xmp"]
+    )  # as darktable names them
+    assert not any("RealityScan" in sentence for sentence in layout.notes) and len(layout.notes) == 1
+
+
 @pytest.mark.parametrize("name", ["images/a?.jpg", "images/con.jpg", "images/a.jpg ./b.jpg"])
 def test_photographs_of_names_that_not_every_system_takes_are_refused_before_they_are_sent(name: str) -> None:
     paths = [name, "images/b.jpg", "images/c.jpg", "images/d.jpg"]

@@ -146,6 +146,11 @@ def test_gaussians_in_one_place_keep_their_digits(count: int) -> None:
     moved[:3, 3], back[:3, 3] = (0.25, 0.0, 0.0), np.negative(ORIGIN)
     assert origin_after(moved, place, ORIGIN) == (ORIGIN[0] + 0.25, *ORIGIN[1:])
     assert origin_after(back, place, ORIGIN) == origin_after(moved, place, NO_ORIGIN) == NO_ORIGIN
+    # one that lies at its local origin and comes near that of the world needs none any more
+    near = np.eye(4)
+    near[:3, 3] = -np.array(ORIGIN) + 1.0
+    assert origin_after(near, np.zeros((1, 3)), ORIGIN, size=2.0) == NO_ORIGIN
+    assert origin_after(moved, np.zeros((1, 3)), ORIGIN, size=2.0) == (ORIGIN[0] + 0.25, *ORIGIN[1:])
 
 
 def test_merge_brings_scenes_of_other_origins_together(octasplat, far, make_scene, tmp_path) -> None:

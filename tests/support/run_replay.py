@@ -3,7 +3,7 @@
 import asyncio
 import json
 import uuid
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +59,49 @@ class RunReplay:
         """Tell of a state of the training of a job that was left running."""
         row = LiveScene(job_id, self.store(scene), self.store(views), step, gaussians)
         asyncio.run(self._show_live(row))
+
+    def show_progress(
+        self, job_id: uuid.UUID, event: Mapping[str, Any], *, stage: str, seconds_left: float | None = None
+    ) -> None:
+        """Tell of a step of a job that was left running, and set its row.
+
+        Args:
+            job_id: the job.
+            event: of the engine, as JSON.
+            stage: that the step is of.
+            seconds_left: of this stage.
+        """
+        is_training = event["kind"] == "training_progress"
+        step, total = ("iteration", "total_iterations") if is_training else ("step", "total_steps")
+        told = {key: value for key, value in event.items() if key != "kind"}
+        told = encode_training_progress(event) if is_training else told
+        row = (stage, event[step], event[total], seconds_left)
+        asyncio.run(self._tell(job_id, row, [("progress", told)]))
+
+    def begin_stage(self, job_id: uuid.UUID, former: str, stage: str, *, seconds: float, steps: int) -> None:
+        """Tell of a job that was left running that a stage has ended, and the next begins."""
+        finished = ("stage_finished", {"stage": former, "seconds": seconds})
+        started = ("stage_started", {"stage": stage, "total_steps": steps})
+        asyncio.run(self._tell(job_id, (stage, 0, steps, None), [finished, started]))
+
+    async def _tell(
+        self,
+        job_id: uuid.UUID,
+        row: tuple[str, int, int, float | None],
+        events: Sequence[tuple[str, Mapping[str, Any]]],
+    ) -> None:
+        async with (
+            open_pool(self._conninfo, max_size=1, wait_seconds=10) as pool,
+            pool.connection() as connection,
+        ):
+            job = await get_job(connection, job_id)
+            assert job is not None and job.state == "running"
+            await connection.execute(
+                "UPDATE jobs SET stage = %s, step = %s, total_steps = %s, seconds_left = %s WHERE id = %s",
+                [*row, job_id],
+            )
+            for kind, told in events:
+                await add_event(connection, job_id, job.attempt, kind, told)
 
     async def _show_live(self, row: LiveScene) -> None:
         async with (

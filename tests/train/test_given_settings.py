@@ -102,6 +102,29 @@ def test_run_of_a_version_that_did_not_keep_it_goes_on_as_before(
     osp.reconstruct(scene, run, **OPTIONS, materials=True, **LIKE_MATERIALS, resume=True)
 
 
+@pytest.mark.parametrize("is_written_anew", [False, True])
+def test_run_of_a_version_without_a_setting_goes_on_by_the_command_that_began_it(
+    scene: Path, tmp_path: Path, is_written_anew: bool
+) -> None:
+    given = [*FEW, "materials.fallback=false", "materials.environment_height=16"]
+    asked = {**OPTIONS, "set": given, "materials": True}
+    output = tmp_path / "run"
+    with pytest.raises(osp.CancelledError):
+        osp.reconstruct(scene, output, **asked, should_stop=lambda: True)
+    config = json.loads((output / "config.json").read_text())
+    materials = config["reconstruction"]["train"]["materials"]
+    assert materials.pop("residual_share") > 0
+    if is_written_anew:  # by this version, where it begins the training anew
+        materials["residual_share"] = None
+    (output / "config.json").write_text(json.dumps(config))
+    asked_for = [*given, "materials.residual_share=0.5"]
+    with pytest.raises(osp.ConfigError, match="without any option --resume takes those of the run"):
+        osp.reconstruct(scene, output, **{**asked, "set": asked_for}, resume=True)
+    run = osp.reconstruct(scene, output, **asked, resume=True)
+    assert run.is_finished and not (output / "residual.npz").exists()
+    assert run.settings["train"]["materials"].get("residual_share") is None
+
+
 def test_photographs_elsewhere_leave_what_was_given(scene: Path, tmp_path: Path) -> None:
     given = stop_before_training(scene, tmp_path / "run")["given"]
     moved = tmp_path / "moved"

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from octasplat.engine.core.rays import RayBatch
-from octasplat.engine.dataset import DatasetView
+from octasplat.engine.dataset import Camera, DatasetView
 from octasplat.engine.gaussians.frames import frames_from_normals, quaternions_from_matrices
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 from octasplat.engine.trace.factory import make_tracer
@@ -99,3 +99,38 @@ def test_a_bottom_that_shines_faintly_through_the_top_still_points_down() -> Non
     tracer.build(upside_down, np.zeros((len(gaussians), 3), np.float32))
     flipped_ids = orient_normals(upside_down, world, np.arange(22), tracer)
     assert set(range(len(top))) <= set(flipped_ids.tolist())
+
+
+class _ViewsDown(PlanarDataset):
+    """Pinhole cameras that look along -z."""
+
+    def __init__(self, origins_world: np.ndarray, side_px: int = 48) -> None:
+        super().__init__()
+        self.origins_world = origins_world
+        self.side_px = side_px
+        self.turn = np.diag([1.0, -1.0, -1.0])
+        self.cameras = (Camera("PINHOLE", (side_px, side_px, side_px / 2, side_px / 2), side_px, side_px),)
+        self.views = tuple(
+            DatasetView(f"{k}.png", 0, self.turn, -self.turn @ origin, side_px, side_px, Path(), None)
+            for k, origin in enumerate(origins_world)
+        )
+
+    def rays(self, view: np.ndarray, y: np.ndarray, x: np.ndarray) -> RayBatch:
+        """Return rays through the centres of pixels."""
+        across, along = ((np.asarray(c) + 0.5) / self.side_px - 0.5 for c in (x, y))
+        ways = np.stack([across, along, np.ones_like(across)], axis=1) @ self.turn
+        return RayBatch(self.origins_world[view], ways / np.linalg.norm(ways, axis=1, keepdims=True))
+
+
+def test_cameras_that_look_elsewhere_do_not_tell_the_side_of_a_wall() -> None:
+    """Three views see a wall from above; twelve stand below it, in another room, and look away from it."""
+    spread = np.random.default_rng(3).uniform(-0.4, 0.4, (15, 2))
+    heights = np.where(np.arange(15) < 3, 2.0, -2.0)
+    world = _ViewsDown(np.concatenate([spread, heights[:, None]], axis=1))
+    wall = _plate(0.0, -1.0, 0.9)
+    tracer = make_tracer()
+    tracer.build(wall, np.zeros((len(wall), 3), np.float32))
+
+    flipped_ids = orient_normals(wall, world, np.arange(15), tracer)
+
+    assert len(flipped_ids) == len(wall) and (wall.rotations[:, 2, 0] > 0.99).all()

@@ -101,7 +101,7 @@ def test_can_be_stopped() -> None:
         asked.append(1)
         return len(asked) > 3
 
-    with pytest.raises(CancelledError, match="residual colors were fitted"):
+    with pytest.raises(CancelledError, match="fitting residual colors"):
         fit_residual_colors(
             scene,
             world,

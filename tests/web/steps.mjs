@@ -404,6 +404,41 @@ const steps = {
         return found;
     },
 
+    /** A job in its training, and then in the fit of residual colors; the test tells of each when the page is ready for it. */
+    async fit() {
+        const found = {};
+        const page = await open();
+        const ready = (signal) => writeFileSync(join(job.signals, signal), "");
+        const bar = () => page.locator("#status .bar-text").innerText();
+        const barSays = (words) => page.waitForFunction((words) => document.querySelector("#status .bar-text")?.textContent.includes(words), words);
+        const stages = () => page.locator("#status .stages li").evaluateAll((items) => items.map((item) => [item.firstChild.textContent.trim(), item.className, item.getAttribute("aria-current")]));
+        // The page itself notes what its bar says, as it is told anew every few seconds.
+        await page.addInitScript(() => {
+            window.bars = [];
+            document.addEventListener("DOMContentLoaded", () => {
+                const look = () => { const text = document.querySelector("#status .bar-text")?.textContent; if (text && window.bars.at(-1) !== text) window.bars.push(text); };
+                look();
+                new MutationObserver(look).observe(document.body, { subtree: true, childList: true, characterData: true });
+            });
+        });
+        await page.goto(`${job.url}/jobs/${job.job}`);
+        await barSays("30/60");
+        ready("opened");
+        await barSays("50/60");
+        found.trained = await stages();
+        ready("trained");
+        await page.waitForFunction(() => document.querySelector("#status .stages .now")?.firstChild.textContent.trim() === "residual");
+        await barSays("residual");
+        ready("fits");
+        await barSays("40/96");
+        found.fits = await stages();
+        found.bar = await bar();
+        found.bars = await page.evaluate(() => window.bars);
+        await shot(page, "residual");
+        found.faults = await portray(`/jobs/${job.job}`, "residual");
+        return found;
+    },
+
     /** A job that was cancelled goes on with other files to write. */
     async goOn() {
         const page = await open();

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from octasplat.engine.core.errors import CancelledError
-from octasplat.engine.core.progress import ProgressCallback
+from octasplat.engine.core.progress import ProgressCallback, no_progress
 from octasplat.engine.core.threads import use_threads
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.shading.protocol import (
@@ -94,7 +94,7 @@ def fit_residual_colors(
     excluded_views: Int64[np.ndarray, " m"],
     threads: int = 0,
     should_stop: Callable[[], bool] = lambda: False,
-    progress: ProgressCallback = lambda done, total, part=0.0: None,
+    progress: ProgressCallback = no_progress,
 ) -> Float32[np.ndarray, "n k 3"]:
     """Return harmonics of the residual color of each Gaussian, display values.
 
@@ -136,7 +136,7 @@ def fit_residual_colors(
             progress(iteration, iterations)
         if should_stop():
             raise CancelledError(
-                "Stopped while residual colors were fitted; the same command with --resume goes on."
+                "Stopped while fitting residual colors; the same command with --resume goes on."
             )
         if iteration % ITERATIONS_PER_BATCH == 0:
             batch = source.draw(rng, iteration // ITERATIONS_PER_BATCH)

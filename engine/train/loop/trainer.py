@@ -8,6 +8,7 @@ import numpy as np
 
 from octasplat.engine.core.errors import CancelledError, TrainingError
 from octasplat.engine.core.events import CheckpointWritten, EventListener, TrainingProgress, Warned
+from octasplat.engine.core.progress import ProgressCallback, no_progress
 from octasplat.engine.dataset.camera_clearance import CameraClearance
 from octasplat.engine.dataset.region import Region
 from octasplat.engine.dataset.view_frusta import ViewFrusta
@@ -251,14 +252,21 @@ class Trainer:
             self._progress(Warned(self.poses.summary()))
         return gaussians
 
-    def measure_views_again(self, shading: ShadingModel) -> None:
+    @property
+    def measured_view_count(self) -> int:
+        """Return how many views are measured at the end: all but those that were left out."""
+        return len(self.dataset.views) - len(self.state.excluded_views)
+
+    def measure_views_again(self, shading: ShadingModel, progress: ProgressCallback = no_progress) -> None:
         """Measure once more how well the exported Gaussians show the views, by what was added to the shading.
 
-        Views that do not fit stay those that were told at the end of the training.
+        Views that do not fit stay those that were told at the end of the training. ``progress`` is told of
+        the views that are measured.
         """
         assert self.views is not None, "the training has ended"
         tracer, left_out = self._components.tracer, self.state.excluded_views
-        self.views = replace(self.views, psnr=self._outlier_detector.report(tracer, shading, left_out).psnr)
+        measured = self._outlier_detector.report(tracer, shading, left_out, progress)
+        self.views = replace(self.views, psnr=measured.psnr)
 
     def _uses_rng_or_stops(self, done: int) -> bool:
         """Return whether anything but a batch uses the generator, or keeps its state, after an iteration."""

@@ -6,13 +6,15 @@ what has just turned away from the viewer from what has not (``flip_normal_cos``
 """
 
 import numpy as np
-from jaxtyping import Float64, Int32, Int64
+from jaxtyping import Bool, Float64, Int32, Int64
 
 from octasplat.engine.core.rays import RayBatch
+from octasplat.engine.dataset.view_frusta import cam_from_world, is_in_image
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.trace.protocol import TraceGradients, Tracer
 from octasplat.engine.train.sampling.batches import grid_pixels
 from octasplat.engine.train.sampling.pixel_sampler import TrainingData, view_sizes_px
+from octasplat.engine.train.views.corrected_views import PosedTrainingData
 
 GRID_TILES = 6
 """So many tiles of a view each way tell who sees what.
@@ -36,7 +38,8 @@ def orient_normals(
     Those whose normal points away from the views in which they weigh most are looked at more closely: a
     surface that few views see at grazing angles weighs less in these than in the many views on the other side
     that see it faintly through what hides it. Such a Gaussian is turned only where most of the views that see
-    its mean unhidden see it from behind; one that no view sees so stays as it is.
+    its mean unhidden see it from behind; one that no view sees so stays as it is. What lies outside of a
+    picture is not seen: a camera that looks elsewhere may stand behind what no view has seen from there.
 
     A Gaussian that is turned looks as before: only its normal points the other way.
 
@@ -57,7 +60,7 @@ def orient_normals(
         )
     normals = gaussians.rotations[:, :, 0].astype(np.float64)
     candidates = np.flatnonzero((normals * towards).sum(axis=1) < 0).astype(np.int32)
-    towards_seen = _summed_unhidden_directions(gaussians, candidates, _view_origins(dataset, indices), tracer)
+    towards_seen = _summed_unhidden_directions(gaussians, candidates, dataset, indices, tracer)
     flipped_ids = candidates[(normals[candidates] * towards_seen).sum(axis=1) < 0]
     gaussians.quats_wxyz[flipped_ids] = _flip_frames(gaussians.quats_wxyz[flipped_ids])
     return flipped_ids
@@ -92,26 +95,44 @@ def _view_origins(dataset: TrainingData, indices: Int64[np.ndarray, " v"]) -> Fl
 def _summed_unhidden_directions(
     gaussians: FlatGaussians,
     ids: Int32[np.ndarray, " c"],
-    origins_world: Float64[np.ndarray, "v 3"],
+    dataset: TrainingData,
+    indices: Int64[np.ndarray, " v"],
     tracer: Tracer,
 ) -> Float64[np.ndarray, "c 3"]:
     """Return for each Gaussian the sum of the unit directions to the cameras that see its mean unhidden."""
     sums = np.zeros((len(ids), 3))
-    if len(origins_world) == 0:
+    if len(indices) == 0:
         return sums
-    most = max(1, MAX_VISIBILITY_RAYS // len(origins_world))
+    origins_world = _view_origins(dataset, indices)
+    most = max(1, MAX_VISIBILITY_RAYS // len(indices))
     for start in range(0, len(ids), most):
-        part = ids[start : start + most]
-        means = np.repeat(gaussians.means_world[part].astype(np.float64), len(origins_world), axis=0)
-        cameras = np.tile(origins_world, (len(part), 1))
-        ways = RayBatch.between(cameras, means)
+        means_world = gaussians.means_world[ids[start : start + most]].astype(np.float64)
+        rows, views = np.nonzero(_is_in_pictures(means_world, dataset, indices))
+        if len(rows) == 0:
+            continue
+        cameras = origins_world[views]
+        ways = RayBatch.between(cameras, means_world[rows])
         clear = RayBatch(cameras, ways.directions_world, 0.0, (1 - VISIBILITY_GAP) * ways.t_max)
         is_seen = tracer.transmittance(clear) >= VISIBLE_TRANSMITTANCE
-        towards = -ways.directions_world * is_seen[:, None]
-        sums[start : start + most] = towards.reshape(len(part), len(origins_world), 3).sum(
-            axis=1, dtype=np.float64
-        )
+        towards = -ways.directions_world[is_seen].astype(np.float64)
+        for axis in range(3):
+            sums[start : start + most, axis] = np.bincount(
+                rows[is_seen], weights=towards[:, axis], minlength=len(means_world)
+            )
     return sums
+
+
+def _is_in_pictures(
+    points_world: Float64[np.ndarray, "p 3"], dataset: TrainingData, indices: Int64[np.ndarray, " v"]
+) -> Bool[np.ndarray, "p v"]:
+    """Return which points lie in the pictures of which views, in all where the cameras are not known."""
+    found = np.ones((len(points_world), len(indices)), np.bool_)
+    if isinstance(dataset, PosedTrainingData):
+        for place, index in enumerate(indices.tolist()):
+            view = dataset.views[index]
+            in_cam = cam_from_world(points_world, view)
+            found[:, place] = is_in_image(in_cam, dataset.cameras[view.camera_index])
+    return found
 
 
 def _flip_frames(quats_wxyz: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
 from octasplat.engine.core.color import composite_over
+from octasplat.engine.core.progress import ProgressCallback, no_progress
 from octasplat.engine.core.psnr import fit_color, psnr
 from octasplat.engine.dataset import DatasetView
 from octasplat.engine.shading.protocol import ShadingModel
@@ -61,8 +62,12 @@ def measure_views(
     background_srgb: Float32[np.ndarray, "3"],
     tracer: Tracer,
     shading: ShadingModel,
+    progress: ProgressCallback = no_progress,
 ) -> ViewPsnr:
-    """Measure the Gaussians that ``tracer`` holds on the views ``indices``; changes nothing."""
+    """Measure the Gaussians that ``tracer`` holds on the views ``indices``; changes nothing.
+
+    ``progress`` is told of the views that are measured, some at a time.
+    """
     plain, corrected = [], []
     for grids in render_grids(
         dataset, indices, background_srgb, tracer, shading, tiles=GRID_TILES, exposed=True
@@ -73,6 +78,7 @@ def measure_views(
         for rendered, photograph, valid in zip(grids.rgb_srgb, target, is_valid, strict=True):
             plain.append(psnr(rendered, photograph, valid))
             corrected.append(psnr(fit_color(rendered, photograph, valid), photograph, valid))
+        progress(len(plain), len(indices))
     return ViewPsnr(indices, *(np.minimum(values, MAX_PSNR_DB) for values in (plain, corrected)))
 
 
@@ -244,13 +250,17 @@ class OutlierDetector:
         return np.sort(find_outlier_views(measured, self._dataset.views, used)[: max(0, max_more)])
 
     def report(
-        self, tracer: Tracer, shading: ShadingModel, left_out: Int64[np.ndarray, " m"]
+        self,
+        tracer: Tracer,
+        shading: ShadingModel,
+        left_out: Int64[np.ndarray, " m"],
+        progress: ProgressCallback = no_progress,
     ) -> TrainingViewReport:
-        """Return how well the finished Gaussians, which ``tracer`` holds, show the views."""
+        """Return how well the finished Gaussians, which ``tracer`` holds, show all views not left out."""
         dataset = self._dataset
         train_used = np.setdiff1d(dataset.train_indices, left_out)
         indices = np.concatenate([train_used, dataset.test_indices])
-        measured = measure_views(dataset, indices, self._background_srgb, tracer, shading)
+        measured = measure_views(dataset, indices, self._background_srgb, tracer, shading, progress)
         outliers = find_outlier_views(measured, dataset.views, train_used)
         names = [view.name for view in dataset.views]
         psnr = dict(zip(measured.indices.tolist(), measured.psnr.tolist(), strict=True))

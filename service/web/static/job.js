@@ -59,7 +59,8 @@ function showProgress(event) {
     if (!bar || !text || !total) return;
     bar.max = total;
     bar.value = step;
-    const left = event.seconds_left == null ? "" : ` · ${duration(event.seconds_left)} left`;
+    // that of a training holds the fit of residual colors, which is a stage of its own
+    const left = event.seconds_left == null ? "" : ` · ${duration(event.seconds_left - (event.seconds_after ?? 0))} left`;
     const name = text.querySelector("b");
     if (event.stage && name) name.textContent = event.stage.replaceAll("_", " ");
     if (name) text.replaceChildren(name, ` ${thousands(step)}/${thousands(total)}${left}`);
