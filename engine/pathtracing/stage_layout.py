@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.pathtracing.stage.stage_file import BALL_RADIUS_FRACTION, StageLayout
+from octasplat.engine.pathtracing.stage.stage_template import BALL_RADIUS_FRACTION, StageLayout
 from octasplat.engine.trace.protocol import Tracer
 
 LEVEL_COSINE = 0.9
