@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+import octasplat as osp
+from octasplat.engine.core.events import Warned
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.pathtracing.stage.stage_file import read_stage
@@ -128,6 +130,27 @@ def test_stage_without_the_materials_of_its_scene_says_so(tmp_path: Path, light:
     done = octasplat("render", tmp_path / "ball.ply", "--stage", tmp_path / "stage.toml", *one)
     assert done.exit_code == 0, done.output
     assert ("materials are left out on this stage" in " ".join(done.output.split())) == told
+
+
+@pytest.mark.parametrize(("light", "told"), [("emissive", True), ("shadowed", False)])
+def test_lamp_that_adds_nothing_to_emissive_gaussians_says_so(
+    scene: Path, tmp_path: Path, light: str, told: bool
+) -> None:
+    (tmp_path / "stage.toml").write_text(
+        f"[[gaussians]]\nlight = '{light}'\n[integrator]\nsamples = 1\n"
+        "[[lights]]\nkind = 'directional'\ndirection = [0, 1, 0]\nirradiance = 1\n"
+        "[[lights]]\nkind = 'directional'\ndirection = [0, 1, 0]\nirradiance = 1\nadds_light = true\n"
+    )
+    done = octasplat("render", scene, "-o", tmp_path / "a", "--stage", tmp_path / "stage.toml", *SMALL)
+    assert done.exit_code == 0, done.output
+    words = "lights[1].adds_light: the scene takes no light of it"
+    assert (words in " ".join(done.output.split())) == told and "lights[0]" not in done.output
+    heard: list[object] = []
+    osp.render(
+        scene, tmp_path / "b", stage_file=tmp_path / "stage.toml", progress=heard.append,
+        mode="turntable", frames=2, width_px=48, height_px=36, threads=2,
+    )  # fmt: skip
+    assert any(isinstance(event, Warned) and words in event.message for event in heard) == told
 
 
 def test_preview_wants_a_stage_and_one_file(scene: Path, tmp_path: Path) -> None:
