@@ -232,7 +232,7 @@ def run(
     )
     if request.up is not None and source.viewpoints is not None:
         report(Warned(UP_OF_RUN_UNUSED))
-    cameras = requested_cameras(request, source)
+    cameras = requested_cameras(request, source, None if request.stage is None else request.stage.up)
     shots = requested_views(request, source) if cameras is None else camera_shots(cameras)
     written = shots[:1] if request.preview else shots
     output = picture_output("render", request, written, [request.stage_file, *_stage_files(request)])

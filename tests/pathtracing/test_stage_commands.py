@@ -193,6 +193,21 @@ def test_stage_init_thing_that_stands_alone_has_its_floor_at_its_foot(tmp_path: 
     assert np.hypot(ball.position[0], ball.position[2]) > 0.2 + ball.scale
 
 
+def test_cameras_around_a_file_hold_the_stages_up_upright(scene: Path, tmp_path: Path) -> None:
+    stage = tmp_path / "stage.toml"
+    stage.write_text("up = [0, 0, 1]\n[[gaussians]]\nlight = 'emissive'\n[integrator]\nsamples = 1\n")
+    for name, more in (("staged", ("--stage", stage)), ("told", ("--up", "z")), ("plain", ())):
+        done = octasplat("render", scene, "-o", tmp_path / name, *SMALL, *more)
+        assert done.exit_code == 0, done.output
+    staged, told, plain = (
+        read_image(tmp_path / name / "frame_0000.png") for name in ("staged", "told", "plain")
+    )
+    assert np.abs(staged - told).mean() < 0.02 < np.abs(plain - told).mean()
+    done = octasplat("render", scene, "-o", tmp_path / "asked", *SMALL, "--up", "-y", "--stage", stage)
+    asked = read_image(tmp_path / "asked" / "frame_0000.png")
+    assert done.exit_code == 0 and np.abs(asked - plain).mean() < 0.02
+
+
 def test_stage_init_ball_beside_a_thing_is_towards_the_first_camera() -> None:
     tracer = make_tracer(TraceSettings(), threads=1)
     tracer.build(pillar())
