@@ -193,6 +193,33 @@ def test_stage_init_thing_that_stands_alone_has_its_floor_at_its_foot(tmp_path: 
     assert np.hypot(ball.position[0], ball.position[2]) > 0.2 + ball.scale
 
 
+def test_stage_init_thing_on_thin_legs_has_its_floor_below_them(tmp_path: Path) -> None:
+    grid = np.linspace(-1, 1, 40)
+    seat_x, seat_z = (part.ravel() for part in np.meshgrid(grid, grid))
+    legs = np.linspace(0.0, -1.0, 60)  # from the floor up to the seat: up is -y
+    places = [np.stack([seat_x, np.full(seat_x.size, -1.0), seat_z], axis=1)]
+    places += [
+        np.stack([np.full(legs.size, x), legs, np.full(legs.size, z)], axis=1)
+        for x in (-0.9, 0.9) for z in (-0.9, 0.9)
+    ]  # fmt: skip
+    means, half = np.concatenate(places).astype(np.float32), np.sqrt(0.5)
+    quats = np.tile(np.float32([1, 0, 0, 0]), (len(means), 1))
+    quats[: seat_x.size] = [half, 0, 0, -half]  # the normal along -y
+    scales = np.full((len(means), 2), -3.5, np.float32)
+    scales[seat_x.size :] = -4.5
+    chair = FlatGaussians(
+        means, quats, scales, np.full(len(means), 4.0, np.float32), np.zeros((len(means), 1, 3), np.float32)
+    )
+    write_gaussian_ply(chair, tmp_path / "chair.ply")
+    done = octasplat("stage", "init", tmp_path / "chair.ply", "-o", tmp_path / "stage.toml")
+    assert done.exit_code == 0, done.output
+    assert "A file does not say what is up" in done.stderr and "--up" in done.stderr
+    assert "A file does not say what is up" in (tmp_path / "stage.toml").read_text()
+    ball = read_stage(tmp_path / "stage.toml").meshes[0]
+    assert isinstance(ball.scale, float)
+    assert ball.position[1] + ball.scale == pytest.approx(0.0, abs=0.15)
+
+
 def test_cameras_around_a_file_hold_the_stages_up_upright(scene: Path, tmp_path: Path) -> None:
     stage = tmp_path / "stage.toml"
     stage.write_text("up = [0, 0, 1]\n[[gaussians]]\nlight = 'emissive'\n[integrator]\nsamples = 1\n")
