@@ -1,7 +1,7 @@
 """``render``: new views of a scene, plain or on a stage."""
 
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
@@ -38,7 +38,11 @@ STAGE_IS_OPAQUE = (
 STAGE_LACKS_MATERIALS = (
     "The scene's materials are left out on this stage, and its harmonics shown, which have no sharp "
     'reflections; light = "relit" of [[gaussians]] shows materials in the light of the stage, such as the '
-    "environment.exr of a run (whose up is its materials.up_world)."
+    "environment.exr of a run (whose up is its materials.up_world): octasplat stage init writes both."
+)
+EMISSIVE_TAKES_NO_LIGHT = (
+    'takes no light of it: all Gaussians of this stage have light = "emissive", so that it lights meshes '
+    'alone; light = "shadowed" of [[gaussians]] adds its light to them, "relit" lights them by it alone.'
 )
 
 
@@ -228,7 +232,7 @@ def run(
     )
     if request.up is not None and source.viewpoints is not None:
         report(Warned(UP_OF_RUN_UNUSED))
-    cameras = requested_cameras(request, source)
+    cameras = requested_cameras(request, source, None if request.stage is None else request.stage.up)
     shots = requested_views(request, source) if cameras is None else camera_shots(cameras)
     written = shots[:1] if request.preview else shots
     output = picture_output("render", request, written, [request.stage_file, *_stage_files(request)])
@@ -297,6 +301,8 @@ def _render_on_stage(plan: _RenderPlan, progress: EventListener, threads: int) -
     shown = {part.light for part in stage.gaussians if part.file is None}
     if has_materials(source.gaussians) and shown - {"relit"}:
         progress(Noted(STAGE_LACKS_MATERIALS))
+    for sentence in _ignored_light(stage):
+        progress(Warned(sentence))
     transparent = request.background == "transparent"
     if transparent and stage.environment is not None and stage.environment.visible:
         progress(Warned(STAGE_IS_OPAQUE))
@@ -317,6 +323,15 @@ def _render_on_stage(plan: _RenderPlan, progress: EventListener, threads: int) -
     )  # fmt: skip
     renderer = compile_stage(stage, scene, shots, transparent=transparent)
     return output.write(shots, renderer.render_fn, finished, progress)
+
+
+def _ignored_light(stage: Stage) -> Iterator[str]:
+    """Return a sentence on each lamp that is to add its light to Gaussians, none of which take light."""
+    if not stage.gaussians or any(scene.light != "emissive" for scene in stage.gaussians):
+        return
+    for number, light in enumerate(stage.lights):
+        if light.adds_light:
+            yield f"lights[{number}].adds_light: the scene {EMISSIVE_TAKES_NO_LIGHT}"
 
 
 OPERATION = Operation(

@@ -192,8 +192,15 @@ def read_render_source(
     )
 
 
-def requested_cameras(request: PictureRequest, source: RenderSource) -> tuple[PinholeCamera, ...] | None:
+def requested_cameras(
+    request: PictureRequest, source: RenderSource, up_world: Sequence[float] | None = None
+) -> tuple[PinholeCamera, ...] | None:
     """Return the cameras of a turntable, path or single image; None for the photographs' views.
+
+    Args:
+        request: what is asked for.
+        source: the scene.
+        up_world: up around a file where the request does not say it; None takes -y.
 
     Raises:
         ConfigError: a camera cannot stand or look as asked, or the path cannot be used.
@@ -212,7 +219,9 @@ def requested_cameras(request: PictureRequest, source: RenderSource) -> tuple[Pi
             choose_fov_y_degrees(request.fov_y_degrees, source.viewpoints),
         )
         orbit = Orbit(
-            axis_named(request.up or "-y"),
+            np.array(up_world, np.float64)
+            if request.up is None and up_world is not None
+            else axis_named(request.up or "-y"),
             None if request.look_at is None else np.array(request.look_at, dtype=np.float64) - origin,
             request.distance,
             request.elevation_degrees,

@@ -1,18 +1,22 @@
 """``stage init``: a first stage of a scene, to be edited."""
 
+import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
 from pydantic import Field
 
 from octasplat.engine.core.errors import OutputError
-from octasplat.engine.core.events import EventListener, Warned, ignore_events
+from octasplat.engine.core.events import EventListener, Noted, Warned, ignore_events
 from octasplat.engine.operations.axes import Axis, axis_named
 from octasplat.engine.operations.base import Operation, Options, Result, WritingRequest, never_stop, stop_if
 from octasplat.engine.operations.render_options import UP_OF_RUN_UNUSED, Point
 from octasplat.engine.settings import renamed_settings
 from octasplat.engine.settings.fields import DatasetFolder, Output, Source
+
+UNKNOWN_UP = "A file does not say what is up, so that -y was taken; --up names another axis, such as z."
 
 
 class StageInitOptions(Options):
@@ -26,8 +30,9 @@ class StageInitOptions(Options):
 class StageInitRequest(StageInitOptions, WritingRequest):
     """Write a stage that fits a scene, the folder of a run or a file of Gaussians, to be edited.
 
-    It knows what is up, has a glass ball on what seems to be the floor, and a light from where the scene's
-    own seems to come. What else there is stands in it as comments.
+    It knows what is up, has a ball on what seems to be the floor, and a light from where the scene's own
+    seems to come; a run with materials is shown with them, in the light that it has learnt. What else there
+    is stands in it as comments.
     """
 
     former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.DATASET
@@ -38,6 +43,9 @@ class StageInitRequest(StageInitOptions, WritingRequest):
         None,
         description="Take the cameras of the photographs in this folder.  [default: those that the run "
         "keeps]",
+    )
+    copy_light: bool = Field(
+        False, description="Put the map of light that the stage names beside it, so that both can be moved."
     )
 
 
@@ -71,22 +79,41 @@ def run(
         OctasplatError: the scene cannot be read.
     """
     from octasplat.engine.operations.render_source import open_stage_scene
+    from octasplat.engine.operations.stage_light import first_stage_light, run_around
     from octasplat.engine.operations.written_files import check_targets
-    from octasplat.engine.pathtracing.stage.stage_file import write_stage_template
+    from octasplat.engine.pathtracing.stage.stage_template import write_stage_template
     from octasplat.engine.pathtracing.stage_scene import first_stage_layout
+    from octasplat.engine.runs.run_folder import VIEWS
 
     output: Path = request.output
     check_targets("stage-init", [output], [request.source, request.dataset], overwrite=request.overwrite)
-    scene = open_stage_scene(request.source, progress, dataset=request.dataset, threads=threads)
+    source, run_folder = request.source, run_around(request.source)
+    is_file_of_run = run_folder is not None and run_folder != source and (run_folder / VIEWS).exists()
+    if run_folder is not None and is_file_of_run and request.up is None:
+        progress(Noted(f"{source} is the scene of the run {run_folder}, which says what is up."))
+        source = run_folder
+    scene = open_stage_scene(source, progress, dataset=request.dataset, threads=threads)
     if request.up is not None and scene.photographs is not None:
         progress(Warned(UP_OF_RUN_UNUSED))
     facts = first_stage_layout(scene, None if request.up is None else axis_named(request.up))
+    if request.up is None and scene.photographs is None:
+        progress(Noted(f"{source}: {UNKNOWN_UP}"))
+        facts = replace(facts, note="\n".join(filter(None, (facts.note, UNKNOWN_UP))))
+    light = first_stage_light(source, scene.gaussians, output.parent, lambda text: progress(Noted(text)))
     stop_if(should_stop)
+    files = [output]
     try:
-        write_stage_template(output, facts)
+        if request.copy_light and light.environment is not None:
+            original, beside = output.parent / light.environment, output.parent / Path(light.environment).name
+            if beside.resolve() != original.resolve():
+                check_targets("stage-init", [beside], [request.source], overwrite=request.overwrite)
+                shutil.copyfile(original, beside)
+                files.append(beside)
+            light = replace(light, environment=beside.name)
+        write_stage_template(output, facts, light)
     except OSError as error:
         raise OutputError(f"Cannot write {output}: {error.strerror or error}.") from error
-    return StageInitResult(files=(output,), up=facts.up, has_floor=facts.has_floor)
+    return StageInitResult(files=tuple(files), up=facts.up, has_floor=facts.has_floor)
 
 
 OPERATION = Operation(

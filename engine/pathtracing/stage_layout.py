@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.pathtracing.stage.stage_file import BALL_RADIUS_FRACTION, StageLayout
+from octasplat.engine.pathtracing.stage.stage_template import BALL_RADIUS_FRACTION, StageLayout
 from octasplat.engine.trace.protocol import Tracer
 
 LEVEL_COSINE = 0.9
@@ -19,8 +19,11 @@ MIN_LEVEL_FRACTION = 0.08
 surfaces looked anywhere, of a crumpled blanket 0.11, of a table with things on it one half."""
 ALONE_FRACTION = 0.9
 """Share of the surface about what the cameras look at, in a scene of a thing that stands alone."""
-LOWEST_QUANTILE = 0.005
-"""Share of the surface of a thing that may lie below its foot, as stray Gaussians do."""
+LEGS_FRACTION, LEGS_DEPTH = 0.01, 0.15
+"""Share of the surface that is enough to stand on, as thin legs are, where it is so far below, in sizes."""
+LOWEST_QUANTILE, LOWEST_OF_LEGS = 0.005, 0.1
+"""Share of the surface of a thing, and of what is below its level part, that may lie below its foot, as stray
+Gaussians do."""
 BESIDE_SPOTS = 32
 HANGING_FRACTIONS = (0.2, 0.3, 0.4, 0.5, 0.6)
 """Where a ball hangs free, on the way from what the cameras look at to the middle of them."""
@@ -69,7 +72,7 @@ def estimate_stage_layout(
         # the thing's own level surface is no floor if much of it lies lower
         if not (_stands_alone(gaussians, near) and _is_within(heights, cosines, area, height, size)):
             return _stage_layout(up, floor, size, light)
-        spots = _spots_beside(some.means_world.astype(np.float64), area, up, size)
+        spots = _spots_beside(some.means_world.astype(np.float64), area, up, size, height)
         visibility = _visibility(tracer, cameras_world, spots + above)
         # a preview shows what the first camera sees
         is_seen = _visibility(tracer, cameras_world[:1], spots + above) > 0.9
@@ -106,9 +109,10 @@ def _is_within(
     height: float,
     size: float,
 ) -> bool:
-    """Return whether more of the surface lies below a height than is level there."""
+    """Return whether more of the surface lies below a height than is level there, or legs reach far below."""
     level = (np.abs(heights - height) < 0.05 * size) & (cosines > LEVEL_COSINE)
-    return bool(area[heights < height - 0.06 * size].sum() > area[level].sum())
+    has_legs = area[heights < height - LEGS_DEPTH * size].sum() > LEGS_FRACTION * area.sum()
+    return bool(has_legs or area[heights < height - 0.06 * size].sum() > area[level].sum())
 
 
 def _spots_beside(
@@ -116,12 +120,14 @@ def _spots_beside(
     area: Float64[np.ndarray, " n"],
     up: Float64[np.ndarray, "3"],
     size: float,
+    level_height: float,
 ) -> Float64[np.ndarray, "s 3"]:
-    """Return places around a thing, on a level with its lowest point."""
+    """Return places around a thing, on a level with its lowest point, below its level part at a height."""
     heights = points @ up
     order = np.argsort(heights)
     shares = np.cumsum(area[order]) / area.sum()
-    foot = heights[order[np.searchsorted(shares, LOWEST_QUANTILE)]]
+    of_legs = LOWEST_OF_LEGS * area[heights < level_height - 0.06 * size].sum() / area.sum()
+    foot = heights[order[np.searchsorted(shares, min(LOWEST_QUANTILE, of_legs))]]
     level = points - heights[:, None] * up
     middle = (level * area[:, None]).sum(axis=0) / area.sum()
     across = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])

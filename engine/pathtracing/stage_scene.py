@@ -11,7 +11,7 @@ from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.local_origin import NO_ORIGIN, Origin, is_set
 from octasplat.engine.dataset.model import Viewpoints
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.pathtracing.stage.stage_file import StageLayout
+from octasplat.engine.pathtracing.stage.stage_template import StageLayout
 from octasplat.engine.pathtracing.stage_layout import estimate_stage_layout
 from octasplat.engine.pathtracing.stage_origin import places_note
 from octasplat.engine.render.pose_paths import Turntable

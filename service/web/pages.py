@@ -51,6 +51,7 @@ from octasplat.service.web.view_models import ACTIVE, job_detail, photographs_of
 from octasplat.workers.db.live_scenes import ShownScene
 from octasplat.workers.db.rows import Artifact
 from octasplat.workers.worker.job_kinds import get_job_kind, job_kinds
+from octasplat.workers.worker.job_kinds.scene_kinds import LIGHT_FILE
 
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 
@@ -118,6 +119,7 @@ async def show_job(request: Request, job_id: uuid.UUID, principal: Reader, servi
         q=_octagon_q(config),
         up=_up_world(config),
         background=_evaluation_background(config),
+        shows_materials=LIGHT_FILE in by_name and _shows_materials(config),
         photograph=preview_path if any(file.path == preview_path for file in photographs) else None,
         further=[options_form(kind, unwritable) for kind in extra] if principal.may("write") else [],
         max_file_bytes=service.settings.max_upload_bytes,
@@ -270,6 +272,18 @@ def _up_world(config: dict[str, object]) -> str:
     found = _config_value(config, "reconstruction", "train", "materials", "up_world")
     known = isinstance(found, list) and len(found) == 3 and all(isinstance(x, int | float) for x in found)
     return json.dumps(found if known else [0, 0, 1])
+
+
+def _shows_materials(config: dict[str, object]) -> bool:
+    """Return whether the 3D view can show the materials of a result, as ``octasplat view`` decides it.
+
+    Where base colors hold the light of a room, light from far away cannot show them.
+    """
+    recipe = _config_value(config, "reconstruction", "train", "materials", "recipe")
+    return (
+        bool(_config_value(config, "reconstruction", "train", "materials", "learn"))
+        and recipe != "near_field"
+    )
 
 
 def _evaluation_background(config: dict[str, object]) -> object:

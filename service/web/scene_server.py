@@ -33,6 +33,8 @@ class ViewedScene:
             page looks at the middle of the scene.
         q: squared radius of an opaque octagon in standard deviations; None for the usual one.
         background: ``black`` or ``white``.
+        light: Radiance HDR map in which materials are shown to begin with; None shows harmonics.
+        light_up: the direction in the world that is at the map's top.
     """
 
     name: str
@@ -40,6 +42,8 @@ class ViewedScene:
     cameras: Mapping[str, Any]
     q: float | None
     background: str
+    light: Path | None = None
+    light_up: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
 
 class SceneServer:
@@ -105,12 +109,16 @@ class _SceneHandler(BaseHTTPRequestHandler):
                 size_bytes=scene.ply.stat().st_size,
                 q=scene.q,
                 background=scene.background,
+                light="" if scene.light is None else f"{page}light.hdr",
+                up=json.dumps(scene.light_up),
             )
             self._send(text.encode(), "text/html; charset=utf-8", PAGE_HEADERS)
         elif path == f"{page}cameras.json":
             self._send(json.dumps(scene.cameras).encode(), "application/json")
         elif path == f"{page}scene.ply":
             self._send_file(scene.ply, "application/octet-stream")
+        elif path == f"{page}light.hdr" and scene.light is not None:
+            self._send_file(scene.light, "image/vnd.radiance")
         else:
             self._send_asset(path)
 

@@ -1,7 +1,9 @@
 """The command ``octasplat``, also as ``python -m octasplat``."""
 
 import webbrowser
+from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import click
 
@@ -39,12 +41,24 @@ def api(ctx: click.Context) -> None:
     show_default=True,
     help="Color behind the scene, to begin with.",
 )
-def view(source: Path, open_page: bool | None, port: int, background: str) -> None:
+@click.option(
+    "--shading",
+    type=click.Choice(["materials", "harmonics"]),
+    help="Colors of the Gaussians, to begin with: materials in the light that a run has learnt, or "
+    "their harmonics.  [default: materials, of a run that has them]",
+)
+def view(
+    source: Path,
+    open_page: bool | None,
+    port: int,
+    background: str,
+    shading: Literal["materials", "harmonics"] | None,
+) -> None:
     """Show a scene in the browser: the folder of a run, or a file of any format.
 
     The page needs no service and no network: this command serves it, to browsers of this machine alone, until
     Ctrl-C. Of a run, one can go from photograph to photograph. Of a run in blocks that is not done yet, it
-    shows what the blocks have learnt so far.
+    shows what the blocks have learnt so far. A run with materials is shown with them, in its own light.
     """
     from octasplat.workers.cli.input_paths import check_readable
 
@@ -57,7 +71,8 @@ def view(source: Path, open_page: bool | None, port: int, background: str) -> No
     with show_progress() as progress:
         scene = read_shown_scene(source, progress)
     # SIGTERM unwinds the program here too, so that the temporary file of the scene is removed.
-    with exit_on_sigterm(), serve_scene(scene, source, port=port, background=background) as viewer:
+    served = partial(serve_scene, scene, source, port=port, background=background, shading=shading)
+    with exit_on_sigterm(), served() as viewer:
         click.echo(f"Open {viewer.url} in a browser of this machine (Ctrl-C ends it).")
         if has_display() if open_page is None else open_page:
             webbrowser.open(viewer.url)

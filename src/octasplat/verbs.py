@@ -1175,6 +1175,7 @@ def stage_init(
     overwrite: bool = False,
     up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None,
     dataset: PathLike | None = None,
+    copy_light: bool = False,
     progress: EventListener | None = None,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
@@ -1188,6 +1189,7 @@ def stage_init(
             command or were changed since. What is read is never replaced.
         up: The axis of a file that points up; a run knows its own. [default: -y]
         dataset: Take the cameras of the photographs in this folder. [default: those that the run keeps]
+        copy_light: Put the map of light that the stage names beside it, so that both can be moved.
         progress: told each event; by default they are logged, or shown in a notebook.
         should_stop: asked now and then; True ends the work with ``CancelledError``.
         threads: number of threads; 0 takes all cores. The result does not depend on it.
@@ -1201,7 +1203,14 @@ def stage_init(
     """
     return run_operation(
         "stage-init",
-        {"overwrite": overwrite, "up": up, "source": source, "output": output, "dataset": dataset},
+        {
+            "overwrite": overwrite,
+            "up": up,
+            "source": source,
+            "output": output,
+            "dataset": dataset,
+            "copy_light": copy_light,
+        },
         progress,
         should_stop,
         threads,

@@ -4,12 +4,15 @@ import tempfile
 import weakref
 import webbrowser
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.events import EventListener
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
+from octasplat.engine.gaussians.materials import has_materials
+from octasplat.engine.render.environment_files import write_environment
 from octasplat.engine.runs.run_folder import BLOCKS, CONFIG, SCENE, is_run, run_viewpoints
 from octasplat.notebook import log_event
 from octasplat.paths import PathLike
@@ -17,6 +20,11 @@ from octasplat.runs import Run
 from octasplat.scenes import Scene, read_scene
 from octasplat.service.web.cameras import read_view_poses, viewer_cameras
 from octasplat.service.web.scene_server import SceneServer, ViewedScene
+
+if TYPE_CHECKING:
+    from octasplat.engine.shading.deferred import DeferredShading
+
+Shading = Literal["materials", "harmonics"]
 
 
 class Viewer:
@@ -65,6 +73,7 @@ def view(
     open_browser: bool = True,
     port: int = 0,
     background: str = "black",
+    shading: Shading | None = None,
 ) -> Viewer:
     """Show a scene in a browser, and return the viewer, which is to be kept.
 
@@ -77,9 +86,12 @@ def view(
         open_browser: open the page; else its address is all.
         port: where to serve it; 0 takes a free one.
         background: ``black`` or ``white``, to begin with.
+        shading: ``materials`` in the light that a run has learnt, or ``harmonics``, to begin with; by default
+            materials, of a run that has them.
 
     Raises:
-        OctasplatError: the source cannot be read, or the port or the background is none.
+        OctasplatError: the source cannot be read, or the port or the background is none, or materials are
+            asked for of a scene without.
 
     >>> import octasplat as osp
     >>> viewer = osp.view(osp.load("scene.ply"), open_browser=False)
@@ -87,7 +99,7 @@ def view(
     """
     scene = source if isinstance(source, Scene) else read_shown_scene(Path(source), log_event)
     path = None if isinstance(source, Scene) else Path(source)
-    viewer = serve_scene(scene, path, port=port, background=background)
+    viewer = serve_scene(scene, path, port=port, background=background, shading=shading)
     if open_browser:
         webbrowser.open(viewer.url)
     return viewer
@@ -109,7 +121,9 @@ def read_shown_scene(path: Path, progress: EventListener) -> Scene:
     return read_scene(path, progress)
 
 
-def serve_scene(scene: Scene, path: Path | None, *, port: int, background: str) -> Viewer:
+def serve_scene(
+    scene: Scene, path: Path | None, *, port: int, background: str, shading: Shading | None = None
+) -> Viewer:
     """Return the viewer of a scene, without opening a browser.
 
     Args:
@@ -117,14 +131,17 @@ def serve_scene(scene: Scene, path: Path | None, *, port: int, background: str) 
         path: where it was read from, which names the page and, of a run, has the cameras; None if nowhere.
         port: where to serve it; 0 takes a free one.
         background: ``black`` or ``white``, to begin with.
+        shading: ``materials`` or ``harmonics``, to begin with; None takes materials where their light is
+            known.
 
     Raises:
-        ConfigError: the port or the background is none.
+        ConfigError: the port or the background is none, or materials cannot be shown.
     """
     if background not in ("black", "white"):
         raise ConfigError(f"background: {background!r} is neither 'black' nor 'white'.")
     if not 0 <= port <= 65535:
         raise ConfigError(f"port: {port} is none; the highest is 65535, and 0 takes a free one.")
+    lit_by = _shown_light(scene, shading)
     run = path if path is not None and is_run(path) and (path / CONFIG).exists() else None
     folder = tempfile.TemporaryDirectory(prefix="octasplat-view-")
     try:
@@ -132,7 +149,12 @@ def serve_scene(scene: Scene, path: Path | None, *, port: int, background: str) 
         write_gaussian_ply(scene.gaussians, ply, facts=scene.facts)
         name = "Scene" if path is None else path.resolve().name
         q = None if run is None else float(Run(run).settings["train"]["trace"]["q"])
-        viewed = ViewedScene(name, ply, {"views": []} if run is None else _run_cameras(run), q, background)
+        cameras = {"views": []} if run is None else _run_cameras(run)
+        viewed = ViewedScene(name, ply, cameras, q, background)
+        if lit_by is not None:
+            light = Path(folder.name) / "light.hdr"
+            write_environment(light, lit_by.light.radiance_linear)
+            viewed = replace(viewed, light=light, light_up=lit_by.settings.up_world)
         try:
             server = SceneServer(viewed, port)
         except OSError as error:
@@ -141,6 +163,29 @@ def serve_scene(scene: Scene, path: Path | None, *, port: int, background: str) 
     except BaseException:
         folder.cleanup()
         raise
+
+
+def _shown_light(scene: Scene, shading: Shading | None) -> "DeferredShading | None":
+    """Return the shading whose light materials are shown in; None for harmonics.
+
+    Raises:
+        ConfigError: materials are asked for, and their light is not known, or it is that of a room.
+    """
+    if shading not in (None, "materials", "harmonics"):
+        raise ConfigError(f"shading: {shading!r} is neither 'materials' nor 'harmonics'.")
+    if shading == "harmonics":
+        return None
+    found = scene.materials if has_materials(scene.gaussians) else None
+    if found is not None and not found.albedo_holds_light:
+        return found
+    if shading == "materials":
+        why = (
+            "holds no light that materials were learnt in"
+            if found is None
+            else "has base colors with the light of the photographs, which light from far away cannot show"
+        )
+        raise ConfigError(f"shading: the scene {why}; leave it out to see harmonics.")
+    return None
 
 
 def _run_cameras(run: Path) -> Mapping[str, Any]:

@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from octasplat.engine.core.errors import CancelledError, ConfigError
-from octasplat.engine.core.events import CheckpointWritten, Event, ImagesSaved, PhaseProgress
+from octasplat.engine.core.events import CheckpointWritten, Event, ImagesSaved, PhaseProgress, Warned
 from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.registry import operation
 from octasplat.engine.operations.relight import RelightRequest
@@ -190,6 +190,24 @@ def test_stage_init_job_matches_command(run, octasplat, tmp_path):
     assert "(up) goes with a file" in done.stderr
     results = results_of("stage-init", run.output, tmp_path / "attempt", {})
     assert contents(results) == {"stage.toml": (tmp_path / "stage.toml").read_bytes()}
+
+
+def test_stage_job_tells_of_lamps_that_add_nothing_to_emissive_gaussians(run, tmp_path):
+    heard: list[Event] = []
+    lamp = {"kind": "directional", "direction": [0, 1, 0], "irradiance": 1, "adds_light": True}
+    stage = {"gaussians": [{"light": "emissive"}], "lights": [lamp], "integrator": {"samples": 1}}
+    results_of(
+        "render",
+        run.output,
+        tmp_path / "attempt",
+        {"mode": "turntable", "frames": 1, "format": "png", **SIZE, "stage": stage},
+        progress=heard.append,
+    )
+    assert [
+        event.message
+        for event in heard
+        if isinstance(event, Warned) and "lights[0].adds_light" in event.message
+    ]
 
 
 def test_stopped_render_job_resumes_from_stored_frames(run, octasplat, tmp_path):

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+import octasplat as osp
+from octasplat.engine.core.events import Warned
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.pathtracing.stage.stage_file import read_stage
@@ -130,6 +132,27 @@ def test_stage_without_the_materials_of_its_scene_says_so(tmp_path: Path, light:
     assert ("materials are left out on this stage" in " ".join(done.output.split())) == told
 
 
+@pytest.mark.parametrize(("light", "told"), [("emissive", True), ("shadowed", False)])
+def test_lamp_that_adds_nothing_to_emissive_gaussians_says_so(
+    scene: Path, tmp_path: Path, light: str, told: bool
+) -> None:
+    (tmp_path / "stage.toml").write_text(
+        f"[[gaussians]]\nlight = '{light}'\n[integrator]\nsamples = 1\n"
+        "[[lights]]\nkind = 'directional'\ndirection = [0, 1, 0]\nirradiance = 1\n"
+        "[[lights]]\nkind = 'directional'\ndirection = [0, 1, 0]\nirradiance = 1\nadds_light = true\n"
+    )
+    done = octasplat("render", scene, "-o", tmp_path / "a", "--stage", tmp_path / "stage.toml", *SMALL)
+    assert done.exit_code == 0, done.output
+    words = "lights[1].adds_light: the scene takes no light of it"
+    assert (words in " ".join(done.output.split())) == told and "lights[0]" not in done.output
+    heard: list[object] = []
+    osp.render(
+        scene, tmp_path / "b", stage_file=tmp_path / "stage.toml", progress=heard.append,
+        mode="turntable", frames=2, width_px=48, height_px=36, threads=2,
+    )  # fmt: skip
+    assert any(isinstance(event, Warned) and words in event.message for event in heard) == told
+
+
 def test_preview_wants_a_stage_and_one_file(scene: Path, tmp_path: Path) -> None:
     assert octasplat("render", scene, "-o", tmp_path / "a.png", "--preview").exit_code == 2
 
@@ -168,6 +191,48 @@ def test_stage_init_thing_that_stands_alone_has_its_floor_at_its_foot(tmp_path: 
     assert isinstance(ball.scale, float)
     assert ball.position[1] + ball.scale == pytest.approx(0.0, abs=0.05)
     assert np.hypot(ball.position[0], ball.position[2]) > 0.2 + ball.scale
+
+
+def test_stage_init_thing_on_thin_legs_has_its_floor_below_them(tmp_path: Path) -> None:
+    grid = np.linspace(-1, 1, 40)
+    seat_x, seat_z = (part.ravel() for part in np.meshgrid(grid, grid))
+    legs = np.linspace(0.0, -1.0, 60)  # from the floor up to the seat: up is -y
+    places = [np.stack([seat_x, np.full(seat_x.size, -1.0), seat_z], axis=1)]
+    places += [
+        np.stack([np.full(legs.size, x), legs, np.full(legs.size, z)], axis=1)
+        for x in (-0.9, 0.9) for z in (-0.9, 0.9)
+    ]  # fmt: skip
+    means, half = np.concatenate(places).astype(np.float32), np.sqrt(0.5)
+    quats = np.tile(np.float32([1, 0, 0, 0]), (len(means), 1))
+    quats[: seat_x.size] = [half, 0, 0, -half]  # the normal along -y
+    scales = np.full((len(means), 2), -3.5, np.float32)
+    scales[seat_x.size :] = -4.5
+    chair = FlatGaussians(
+        means, quats, scales, np.full(len(means), 4.0, np.float32), np.zeros((len(means), 1, 3), np.float32)
+    )
+    write_gaussian_ply(chair, tmp_path / "chair.ply")
+    done = octasplat("stage", "init", tmp_path / "chair.ply", "-o", tmp_path / "stage.toml")
+    assert done.exit_code == 0, done.output
+    assert "A file does not say what is up" in done.stderr and "--up" in done.stderr
+    assert "A file does not say what is up" in (tmp_path / "stage.toml").read_text()
+    ball = read_stage(tmp_path / "stage.toml").meshes[0]
+    assert isinstance(ball.scale, float)
+    assert ball.position[1] + ball.scale == pytest.approx(0.0, abs=0.15)
+
+
+def test_cameras_around_a_file_hold_the_stages_up_upright(scene: Path, tmp_path: Path) -> None:
+    stage = tmp_path / "stage.toml"
+    stage.write_text("up = [0, 0, 1]\n[[gaussians]]\nlight = 'emissive'\n[integrator]\nsamples = 1\n")
+    for name, more in (("staged", ("--stage", stage)), ("told", ("--up", "z")), ("plain", ())):
+        done = octasplat("render", scene, "-o", tmp_path / name, *SMALL, *more)
+        assert done.exit_code == 0, done.output
+    staged, told, plain = (
+        read_image(tmp_path / name / "frame_0000.png") for name in ("staged", "told", "plain")
+    )
+    assert np.abs(staged - told).mean() < 0.02 < np.abs(plain - told).mean()
+    done = octasplat("render", scene, "-o", tmp_path / "asked", *SMALL, "--up", "-y", "--stage", stage)
+    asked = read_image(tmp_path / "asked" / "frame_0000.png")
+    assert done.exit_code == 0 and np.abs(asked - plain).mean() < 0.02
 
 
 def test_stage_init_ball_beside_a_thing_is_towards_the_first_camera() -> None:

@@ -21,12 +21,9 @@ from octasplat.engine.pathtracing.stage.model import (
     Stage,
     StageGaussians,
 )
-from octasplat.engine.pathtracing.stage.stage_file import (
-    StageLayout,
-    parse_stage,
-    read_stage,
-    write_stage_template,
-)
+from octasplat.engine.pathtracing.stage.stage_file import parse_stage, read_stage
+from octasplat.engine.pathtracing.stage.stage_template import StageLayout, StageLight, write_stage_template
+from tests.support.bad_stages import BAD_STAGES, VALIDATORS_WORDS
 
 GOLD = '[[meshes]]\nshape = "sphere"\nmaterial = {{ kind = "metal", {key} = [0.9, 0.8, 0.5] }}\n'
 BALL = '[[meshes]]\nshape = "sphere"\n'
@@ -107,13 +104,13 @@ def test_stage_file_with_all_keys_is_read(tmp_path: Path) -> None:
         ("[[lights]]\nposition = [0, 0, 0]", r"lights\[0\]: has no `kind`"),
         ('[[lights]]\nkind = "lamp"', "no kind 'lamp'; choose one of 'point', 'spot'"),
         ('[meshes]\nshape = "cube"', r"write \[\[meshes\]\] with two brackets"),
-        (BALL + "scale = [1, 2]", r"meshes\[0\]\.scale: is one positive number, or three"),
-        ("up = [0, 1]", r"up: is three numbers, such as \[0, 0, 1\] \(it is \[0, 1\]\)"),
+        (BALL + "scale = [1, 2]", r"meshes\[0\]\.scale: must be one positive number, or three"),
+        ("up = [0, 1]", r"up: must be three numbers, such as \[0, 0, 1\] \(it is \[0, 1\]\)"),
         (BALL + 'material = { kind = "diffuse", color_srgb = "#ff00" }', r"material\.color_srgb: .*#cc8033"),
         (BALL + 'material = { kind = "diffuse", color = 1 }', r"material\.color; the nearest is color_srgb"),
         (BALL + "positions = [0, 0, 0]", "the nearest is position"),
         (BALL + "scale = .2", r"write 0\.2 for \.2"),
-        (BALL + 'material = "glass"', r"\.material: is a table, such as \{ kind = .* \(it is glass\)"),
+        (BALL + 'material = "glass"', r"\.material: is a table, such as \{ kind = .* \(it is \"glass\"\)"),
         (BALL + "on = [1, 2]", r"meshes\[0\]\.on: is a table, such as \{ view"),
         (BALL + "keys = { frame = 1 }", r"\.keys: is a list of tables, such as \[\{ frame = 0"),
         (
@@ -128,6 +125,56 @@ def test_stage_file_error_names_key(text: str, words: str) -> None:
     with pytest.raises(ConfigError, match=words) as caught:
         parse_stage(text, "my.toml")
     assert str(caught.value).startswith("my.toml: ") and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (
+            BALL + "scale = -1",
+            "meshes[0].scale: must be one positive number, or three of them, such as [1, 1, 2] (it is -1).",
+        ),
+        ("[[gaussians]]\nscale = -1", "gaussians[0].scale: must be one positive number (it is -1)."),
+        (
+            "[integrator]\nsamples = 1.5",
+            "integrator.samples: must be a whole number from 1 to 65536 (it is 1.5).",
+        ),
+        (
+            '[integrator]\ntone = "aces"',
+            'integrator.tone: must be one of "none", "reinhard", "filmic" (it is "aces").',
+        ),
+        (
+            '[[lights]]\nkind = "point"\nposition = [0, 0, 0]',
+            "lights[0].intensity: is missing; give a number of 0 or more.",
+        ),
+        (
+            '[[lights]]\nkind = "point"\nintensity = 1',
+            "lights[0].position: is missing; give three numbers, such as [0, 0, 1].",
+        ),
+        (
+            '[environment]\nfile = "a.hdr"\nrotation_degrees = [0, 0, 90]',
+            "environment.rotation_degrees: must be one number (it is [0, 0, 90]).",
+        ),
+        (BALL + "position = [0, nan, 0]", "meshes[0].position[1]: must be a finite number (it is nan)."),
+        (
+            '[[gaussians]]\nshadows_on_meshes = "a"',
+            'gaussians[0].shadows_on_meshes: must be true or false (it is "a").',
+        ),
+        ('version = "1"', 'version: must be 1 (it is "1").'),
+        ("lights = 3", "lights: is a list; write [[lights]] with two brackets (it is 3)."),
+    ],
+)
+def test_stage_file_error_says_what_to_give(text: str, sentence: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse_stage(text, "my.toml")
+    assert str(caught.value) == f"my.toml: {sentence}"
+
+
+@pytest.mark.parametrize("text", BAD_STAGES)
+def test_refusals_of_stages_have_words_of_our_own(text: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse_stage(text, "my.toml")
+    assert not VALIDATORS_WORDS.search(str(caught.value)), str(caught.value)
 
 
 def test_stage_color_may_be_hexadecimal() -> None:
@@ -191,6 +238,24 @@ def test_starter_stage_states_every_default(tmp_path: Path) -> None:
     plain = re.sub(r"(?m)^# (?!material|on|\[)(\w+ = )", r"\1", text[: text.index("# A mirror for a floor")])
     tail = re.sub(r"(?m)^# (\w+ = )", r"\1", text[text.index("[integrator]") :])
     assert parse_stage(plain + tail, "all.toml") == stage.model_copy(update={"lights": ()})
+
+
+def test_starter_stage_of_materials_is_lit_by_its_map_and_its_suggestions_are_valid(tmp_path: Path) -> None:
+    path, layout = tmp_path / "stage.toml", StageLayout((0, -1, 0), (0, 0.5, 0), 2.0, (0.6, 0.8, 0))
+    name = 'a "b" {x}/ä.exr'
+    (tmp_path / name).parent.mkdir()
+    (tmp_path / name).write_bytes(b"?")
+    up = (0.1, 0.43589, 0.8944443)
+    write_stage_template(path, layout, StageLight("relit", name, up, ("It has {materials}, " * 12,)))
+    stage = read_stage(path)
+    assert stage.environment == Environment(file=name, up=up, visible=False)
+    assert stage.gaussians == (StageGaussians(light="relit"),) and stage.lights == ()
+    notes = [line for line in path.read_text().splitlines() if "has {mat" in line]
+    assert len(notes) > 1 and max(map(len, notes)) <= 110 and all(line.startswith("# ") for line in notes)
+    # with the lamps that are comments it is a stage, too
+    text = re.sub(r"(?m)^# (?!material|on|texture)(\[|\w+ = )", r"\1", path.read_text())
+    full = parse_stage(text, "all.toml")
+    assert len(full.lights) == 4 and full.environment is not None and full.environment.up == up
 
 
 def test_reading_stages_needs_neither_torch_nor_numba() -> None:

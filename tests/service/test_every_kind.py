@@ -273,7 +273,7 @@ async def test_every_other_kind_of_job_succeeds(
         assert len(await made("render", {**SMALL, "format": "png", "stage": STAGE})) == 2
         lit = {**SMALL, "format": "png", "environments": ["sky.hdr"], "samples": 1}
         assert len(await made("relight", lit, sky__hdr=HDR)) == 2
-        assert await made("stage-init", {}) == {"stage.toml"}
+        assert await made("stage-init", {}) == {"stage.toml", "environment.exr"}
         assert "edits.json" in await made("material", {"set": {"roughness": 0.4}})
         assert await made("info", {}) == {"info.json", "picture.png"}
         surface = {"depth_side": 64, "texture_size": 64, "max_triangles": ["400"], "fit": False}

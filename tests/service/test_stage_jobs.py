@@ -27,6 +27,7 @@ from octasplat.service.state import Service
 from octasplat.workers.cli.main import cli
 from octasplat.workers.db.locks import lock_owner
 from octasplat.workers.queue.job_results import ResultFile
+from tests.support.bad_stages import BAD_STAGES, VALIDATORS_WORDS
 from tests.support.service_harness import (
     ConnectService,
     claim_job,
@@ -102,7 +103,7 @@ BAD = [
     ("[integrator]\nsamples = 65536", "ceiling", "#/options/stage/integrator/samples", "paths of light"),
     (
         "[[lights]]\nkind='point'\nposition=[0,0,0]\nintensity=1\n" * 1001,
-        "options", "#/options/stage/lights", "1000 items",
+        "options", "#/options/stage/lights", "at most 1000",
     ),
     (
         "[[gaussians]]\nlight='relit'\n"
@@ -124,6 +125,14 @@ async def test_invalid_stage_problem_names_key(connect_service: ConnectService) 
             assert refused.headers["content-type"] == "application/problem+json"
             [fault] = problem["errors"]
             assert fault["pointer"] == pointer and words in fault["detail"], fault
+        for stage in BAD_STAGES:
+            refused = await http.post("/v1/jobs", json={**body, "options": {"stage": stage}})
+            assert refused.status_code == 422, (stage, refused.text)
+            assert not VALIDATORS_WORDS.search(refused.text), refused.text
+            for fault in refused.json()["errors"]:
+                assert (
+                    fault["pointer"].startswith("#/options/stage") and "constrained" not in fault["pointer"]
+                )
         # As JSON, where there is no NaN, but Python's reader takes it.
         text = json.dumps(
             {**body, "options": {"stage": {"meshes": [{"shape": "cube", "scale": float("nan")}]}}}

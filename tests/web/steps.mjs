@@ -545,6 +545,31 @@ const steps = {
         return { heading: await page.textContent("h1"), count: await page.textContent("#viewer .count"), shown: await brightness(page) };
     },
 
+    /** What a page shows at first, and after its button for materials. */
+    async materials() {
+        const page = await open();
+        await page.goto(job.url);
+        await page.waitForSelector("#viewer[data-ready=yes]");
+        const button = page.locator("#viewer [data-do=materials]"), found = { looks: [], lit: [], pressed: [] };
+        const note = async () => {
+            await page.waitForSelector("#viewer[data-rested=yes][data-drawn=all]");
+            await page.waitForTimeout(500);
+            await page.waitForSelector("#viewer[data-rested=yes][data-drawn=all]");
+            found.looks.push((await brightness(page)).mean);
+            found.lit.push(await page.getAttribute("#viewer", "data-lit"));
+            found.pressed.push(await button.isVisible() && await button.getAttribute("aria-pressed"));
+        };
+        if (job.lit) await page.waitForSelector("#viewer[data-lit=learnt]");
+        await note();
+        await shot(page, "view_first", false);
+        if (await button.isVisible()) for (let k = 0; k < 2; k++) {
+            await button.click();
+            await note();
+            if (k === 0) await shot(page, "view_harmonics", false);
+        }
+        return found;
+    },
+
     /** From the list to the viewer and back with keys alone; nothing is clicked. */
     async keyboard() {
         const found = {};

@@ -13,6 +13,10 @@ import numpy as np
 import pytest
 
 import octasplat as osp
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.shading.material_settings import MaterialSettings
+from octasplat.engine.shading.recipes import material_shading
+from tests.support.light_scenes import shiny_ball
 from tests.support.web_harness import Browse
 
 
@@ -65,6 +69,51 @@ def test_scene_server_other_paths_are_404(viewer: osp.Viewer, path: str) -> None
 
 def test_scene_server_refuses_foreign_origin(viewer: osp.Viewer) -> None:
     assert get(viewer.url, "scene.ply", host="rebound.example")[0] == 403
+
+
+def lit_scene(recipe: str = "split_sum") -> osp.Scene:
+    """A white ball in the red light that it was learnt in, whose harmonics are blue."""
+    settings = MaterialSettings.model_validate(
+        {"learn": True, "recipe": recipe, "environment_height": 16, "up_world": [0.0, -1.0, 0.0]}
+    )
+    gaussians = shiny_ball(1500, 1.0, albedo=(1.0, 1.0, 1.0), metallic=0.0, roughness=1.0)
+    gaussians.sh[:, 0] = np.array([-1.7, -1.7, 0.5])
+    shading = material_shading(settings.recipe)(settings, extent_world=4.0)
+    shading.light.set_radiance(np.tile(np.float32([0.8, 0.1, 0.1]), (16, 32, 1)))
+    return osp.Scene(gaussians, materials=shading)
+
+
+def test_materials_are_served_in_the_light_that_was_learnt() -> None:
+    with osp.view(lit_scene(), open_browser=False) as viewer:
+        page = get(viewer.url, "")[2].decode()
+        assert f'data-light="{urlsplit(viewer.url).path}light.hdr"' in page
+        assert 'data-up="[0.0, -1.0, 0.0]"' in page
+        status, kind, light = get(viewer.url, "light.hdr")
+        assert (status, kind) == (200, "image/vnd.radiance") and light.startswith(b"#?")
+    with osp.view(lit_scene(), open_browser=False, shading="harmonics") as viewer:
+        assert b"data-light" not in get(viewer.url, "")[2] and get(viewer.url, "light.hdr")[0] == 404
+
+
+def test_materials_that_cannot_be_shown_are_not(scene: osp.Scene) -> None:
+    for other, words in ((scene, "holds no light"), (lit_scene("near_field"), "light of the photographs")):
+        with osp.view(other, open_browser=False) as viewer:
+            assert b"data-light" not in get(viewer.url, "")[2]
+        with pytest.raises(ConfigError, match=words):
+            osp.view(other, open_browser=False, shading="materials")
+
+
+@pytest.mark.tools
+@pytest.mark.heavy
+def test_browser_shows_materials_at_first_and_harmonics_when_asked(browse: Browse) -> None:
+    with osp.view(lit_scene(), open_browser=False) as viewer:
+        found = browse("materials", viewer.url, lit=True)
+    assert found["lit"] == ["learnt", "none", "learnt"] and found["complaints"] == []
+    assert found["pressed"] == ["true", "false", "true"]
+    materials, harmonics, again = found["looks"]
+    assert materials == pytest.approx(again, abs=0.1) and abs(materials - harmonics) > 5
+    with osp.view(lit_scene(), open_browser=False, shading="harmonics") as viewer:
+        other = browse("materials", viewer.url, lit=False)
+    assert other["pressed"] == [False] and other["looks"] == [pytest.approx(harmonics, abs=0.1)]
 
 
 def test_scene_server_addresses_differ(viewer: osp.Viewer, scene: osp.Scene) -> None:

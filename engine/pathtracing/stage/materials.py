@@ -170,3 +170,9 @@ Material = Annotated[
     Diffuse | Mirror | Glass | Metal | Dielectric | MetallicRoughness,
     Field(discriminator="kind"),
 ]
+
+TEXTURE_KEYS = (
+    "texture", "metallic_roughness_texture", "normal_texture", "emission_texture", "opacity_texture",
+    "clear_coat_texture", "clear_coat_roughness_texture",
+)  # fmt: skip
+"""Keys of materials that name images."""

@@ -50,6 +50,14 @@ class EvaluateKind(OperationKind):
         return options.model_copy(update={"all_views": True})
 
 
+class StageInitKind(OperationKind):
+    """Kind of jobs that write a first stage."""
+
+    def request_paths(self, task: Task, options: Any) -> dict[str, Any]:
+        """Return the scene and the stage, beside which the map of light that it names is put."""
+        return {**super().request_paths(task, options), "copy_light": True}
+
+
 class InfoKind(OperationKind):
     """Kind of jobs that describe a scene."""
 
@@ -86,11 +94,11 @@ BUILTIN_KINDS: tuple[JobKind[Any], ...] = (
         title="The scene of a reconstruction with materials in other light",
         source_files=(LIGHT_FILE, *RUN_FILES[:4]),
     ),
-    OperationKind(
+    StageInitKind(
         STAGE_INIT,
         title="A commented stage that fits the scene of a reconstruction",
         stages=("read",),
-        source_files=(*RUN_FILES[:4], BACKGROUND_FILE),
+        source_files=(*RUN_FILES[:4], LIGHT_FILE, EXACT_LIGHT_FILE, BACKGROUND_FILE),
         output="stage.toml",
     ),
     SceneEditKind(

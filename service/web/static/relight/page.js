@@ -75,18 +75,22 @@ async function liveFile() {
 }
 
 let newest = 0; // light that was chosen; that of one before may still be on its way
+let isLoading = false;
 
 /** Shows the light in the 3D view. */
 async function showLive() {
     const number = ++newest, { live } = fieldValues(form);
     trials.complain("");
+    isLoading = true;
     try {
         const map = live ? readHdr(await liveFile()) : null;
         if (number !== newest) return;
+        isLoading = false;
         turnLive(map);
         section.dataset.live = live || "none";
     } catch (error) {
         if (number !== newest) return;
+        isLoading = false;
         form.elements.live.value = "";
         section.dataset.live = "none";
         viewer.dispatchEvent(new CustomEvent("light", { detail: { map: null, degrees: 0 } }));
@@ -97,13 +101,24 @@ async function showLive() {
 /** Turns the light in the 3D view as the form says by now, or shows another one. */
 function turnLive(map) {
     const { live, rotation_degrees } = fieldValues(form);
-    viewer.dispatchEvent(new CustomEvent("light", { detail: { map, degrees: live === "this" ? rotation_degrees : 0 } }));
+    const lit = live === "this" ? "other" : live || "none";
+    viewer.dispatchEvent(new CustomEvent("light", { detail: { map, degrees: live === "this" ? rotation_degrees : 0, lit } }));
+}
+
+/** Says what the 3D view shows by itself, or by its own button. */
+function followLive() {
+    const { lit } = viewer.dataset;
+    if (isLoading || !lit || lit === "other") return;
+    form.elements.live.value = lit === "learnt" ? "learnt" : "";
+    section.dataset.live = form.elements.live.value || "none";
 }
 
 const viewer = document.getElementById("viewer");
 const offerLive = () => { form.elements.live.closest(".field").hidden = false; };
 if (viewer?.dataset.materials) offerLive();
 else viewer?.addEventListener("materials", offerLive);
+viewer?.addEventListener("lit", followLive);
+if (viewer) followLive();
 form.elements.live.addEventListener("change", showLive);
 for (const name of ["map", "file"]) form.elements[name].addEventListener("change", () => { if (form.elements.live.value === "this") showLive(); });
 form.elements.rotation_degrees.addEventListener("input", () => { if (section.dataset.live === "this") turnLive(); });

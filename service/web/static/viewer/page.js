@@ -3,6 +3,7 @@
 import { OrbitControls, PerspectiveCamera, Vector3 } from "../vendor/three.js";
 import { CameraPath } from "./camera_path.js";
 import { EditPanel } from "./edit_panel.js";
+import { readHdr } from "./environment.js";
 import { Limits } from "./limits.js";
 import { Marks } from "./marks.js";
 import { Overlay } from "./overlay.js";
@@ -202,7 +203,7 @@ class Viewer extends LoadingViewer {
         this.splats.setBackground(...BACKGROUNDS[this.background]);
         this.canvas.addEventListener("webglcontextlost", () => this.lose());
         this.canvas.addEventListener("webglcontextrestored", () => this.restore());
-        this.takeLight();
+        this.takeLight(scene);
         new ResizeObserver(() => this.resize()).observe(this.canvas.parentElement);
         this.resize();
         this.marks = new Marks(this);
@@ -274,16 +275,45 @@ class Viewer extends LoadingViewer {
         this.wake();
     }
 
-    /** Where materials can be lit here, whoever has a map says so: {map, degrees}, or a map of null for none. */
-    takeLight() {
+    /**
+     * Where materials can be lit here, whoever has a map says so: {map, degrees, lit}, or a map of null for none.
+     * The light that was learnt with them is there from the beginning.
+     */
+    takeLight(scene) {
         if (!this.splats.lighting) return;
-        this.box.addEventListener("light", ({ detail: { map, degrees } }) => {
-            if (map !== undefined) this.splats.setLight(map);
-            this.splats.lighting.turn(JSON.parse(this.box.dataset.up), degrees);
-            this.wake();
-        });
+        this.box.addEventListener("light", ({ detail: { map, degrees, lit } }) => this.setLight(map, degrees, lit));
         this.box.dataset.materials = "yes";
         this.box.dispatchEvent(new Event("materials"));
+        if (!this.box.dataset.light || !scene.knowsMaterials) return;
+        this.box.querySelector("[data-do=materials]").hidden = false;
+        this.showLearnt();
+    }
+
+    /** `lit` is "learnt", "other" or "none". */
+    setLight(map, degrees, lit = map ? "other" : "none") {
+        if (map !== undefined) {
+            this.splats.setLight(map);
+            this.box.dataset.lit = lit;
+            this.box.querySelector("[data-do=materials]").setAttribute("aria-pressed", String(lit === "learnt"));
+            this.box.dispatchEvent(new Event("lit"));
+        }
+        this.splats.lighting.turn(JSON.parse(this.box.dataset.up), degrees);
+        this.wake();
+    }
+
+    /** Shows the materials in the light that was learnt with them. */
+    async showLearnt() {
+        const before = this.box.dataset.lit;
+        try {
+            if (!this.learnt) {
+                const response = await fetch(this.box.dataset.light);
+                if (!response.ok) throw new Error();
+                this.learnt = readHdr(await response.arrayBuffer());
+            }
+            if (this.box.dataset.lit === before) this.setLight(this.learnt, 0, "learnt"); // nobody has chosen another since
+        } catch {
+            this.place.textContent = "The light that was learnt could not be loaded, so materials are not shown.";
+        }
     }
 
     do(action, number) {
@@ -301,6 +331,10 @@ class Viewer extends LoadingViewer {
         } else if (action === "background") {
             this.background = this.background === "black" ? "white" : "black";
             this.splats.setBackground(...BACKGROUNDS[this.background]);
+        } else if (action === "materials") {
+            if (!this.splats.lighting || !this.box.dataset.light || this.box.querySelector("[data-do=materials]").hidden) return;
+            if (this.box.dataset.lit === "learnt") this.setLight(null, 0);
+            else this.showLearnt();
         } else if (action === "key") this.tellPath(this.path.add(this.camera));
         else if (action === "save-path") this.path.save("camera_path.json");
         else if (action === "clear-path") {

@@ -78,6 +78,7 @@ export function readGaussians(bytes) {
     const ofMaterial = MATERIAL.every((name) => name in offsets) ? readers(MATERIAL) : null;
     const ambient = "ambient" in offsets ? reader("ambient") : () => 1;
     const materials = ofMaterial && new Uint16Array(count * 8);
+    let knowsMaterials = ofMaterial !== null; // what came from a scene without has 0 in all channels
 
     const geometry = new Float32Array(count * 12);
     const harmonics = new Uint16Array(count * shCount * 4);
@@ -113,12 +114,15 @@ export function readGaussians(bytes) {
             bounds[i] = 0;
         }
         ofMaterial?.forEach((read, k) => { materials[i * 8 + k] = toHalf(read(row)); });
-        if (materials) materials[i * 8 + 5] = toHalf(ambient(row));
+        if (materials) {
+            materials[i * 8 + 5] = toHalf(ambient(row));
+            knowsMaterials &&= ofMaterial.some((read) => read(row) !== 0) || ("ambient" in offsets && ambient(row) !== 0);
+        }
         for (let channel = 0; channel < 3; channel++) {
             const h = i * shCount * 4 + channel;
             harmonics[h] = toHalf(dc[channel](row));
             for (let k = 1; k < shCount; k++) harmonics[h + 4 * k] = toHalf(restReaders[channel][k - 1](row));
         }
     }
-    return { count, shCount, geometry, harmonics, bounds, materials };
+    return { count, shCount, geometry, harmonics, bounds, materials, knowsMaterials };
 }

@@ -4,7 +4,7 @@ import { Vector3 } from "../vendor/three.js";
 
 const TURN_PER_SECOND = 1.1;
 const LOOK_PER_PIXEL = 0.004;
-const ACTIONS = { n: "next", p: "previous", r: "reset", f: "toggle-fly", b: "background", k: "key", c: "cameras", m: "measure" };
+const ACTIONS = { n: "next", p: "previous", r: "reset", f: "toggle-fly", b: "background", l: "materials", k: "key", c: "cameras", m: "measure" };
 const HELD = new Set(["KeyW", "KeyA", "KeyS", "KeyD", "KeyQ", "KeyE", "ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", "Equal", "Minus", "NumpadAdd", "NumpadSubtract"]);
 
 const BY_SIGN = { "+": "Equal", "=": "Equal", "-": "Minus", "\u2212": "Minus" };

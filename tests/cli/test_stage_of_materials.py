@@ -1,0 +1,140 @@
+"""``stage init`` of a run with materials: lit by the light that the run has learnt, at every door."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import octasplat as osp
+from octasplat.engine.core.psnr import psnr
+from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from octasplat.engine.pathtracing.stage.stage_file import read_stage
+from octasplat.engine.render.environment_files import write_environment
+from octasplat.engine.render.image_files import read_image
+from tests.cli.test_render_jobs import results_of
+
+VIEW = ("--max-side", 48, "--photograph", "view_000.png", "--threads", 1)
+UP = [0.0, -0.8, 0.6]
+
+
+@pytest.fixture(scope="module")
+def lit_run(shiny_run, tmp_path_factory) -> Path:
+    """A run with materials whose light differs all around, with an up of its own."""
+    run = tmp_path_factory.mktemp("lit") / "run"
+    shutil.copytree(shiny_run, run)
+    light = np.full((16, 32, 3), 0.05, np.float32)
+    light[:, :16, 0], light[:8, :, 1], light[:, 8:24, 2] = 0.6, 0.4, 0.5
+    for name in ("environment.exr", "environment.hdr"):
+        write_environment(run / name, light)
+    config = json.loads((run / "config.json").read_text())
+    config["reconstruction"]["train"]["materials"]["up_world"] = UP
+    (run / "config.json").write_text(json.dumps(config))
+    return run
+
+
+def without_ball(stage: Path, samples: int = 64) -> None:
+    """Take the meshes out of a stage."""
+    text = stage.read_text().replace("samples = 16", f"samples = {samples}")
+    start, end = text.index("[[meshes]]"), text.index("# A mirror for a floor.")
+    stage.write_text(text[:start] + text[end:])
+
+
+def test_stage_init_of_a_run_with_materials_shows_what_render_does(lit_run, octasplat, tmp_path):
+    stage = tmp_path / "elsewhere" / "stage.toml"
+    stage.parent.mkdir()
+    done = octasplat("stage", "init", lit_run, "-o", stage)
+    assert done.exit_code == 0, done.output
+    read = read_stage(stage)
+    assert read.gaussians[0].light == "relit" and read.environment is not None and read.lights == ()
+    assert (stage.parent / read.environment.file).resolve() == (lit_run / "environment.exr").resolve()
+    assert read.environment.up == tuple(UP) and not read.environment.visible
+    assert "materials" in stage.read_text() and "learnt" in stage.read_text()
+    without_ball(stage)
+    turned = tmp_path / "elsewhere" / "turned.toml"
+    turned.write_text(stage.read_text().replace("# rotation_degrees = 0.0 ", "rotation_degrees = 90.0 "))
+    images = []
+    for name, more in (("plain", ()), ("staged", ("--stage", stage)), ("turned", ("--stage", turned))):
+        done = octasplat("render", lit_run, "-o", tmp_path / name, *VIEW, *more)
+        assert done.exit_code == 0, done.output
+        assert "materials are left out" not in done.output + done.stderr
+        images.append(read_image(next((tmp_path / name).rglob("*.png")))[..., :3])
+    near, far = psnr(images[0], images[1]), psnr(images[0], images[2])
+    assert near > 26 and near > far + 3
+
+
+def test_stage_init_of_a_runs_scene_file_takes_the_light_and_up_of_the_run(lit_run, octasplat, tmp_path):
+    stages = [tmp_path / "run.toml", tmp_path / "file.toml"]
+    for source, stage in zip((lit_run, lit_run / "scene.ply"), stages, strict=True):
+        done = octasplat("stage", "init", source, "-o", stage)
+        assert done.exit_code == 0, done.output
+    assert stages[0].read_bytes() == stages[1].read_bytes()
+    assert "which says what is up" in done.stderr
+    # whoever says what is up of the file is heard
+    done = octasplat("stage", "init", lit_run / "scene.ply", "--up", "x", "-o", tmp_path / "x.toml")
+    assert done.exit_code == 0 and "A file does not say" not in done.stderr
+    read = read_stage(tmp_path / "x.toml")
+    assert read.up == (1, 0, 0) and read.environment is not None and read.environment.up == tuple(UP)
+
+
+def test_stage_init_puts_the_light_beside_the_stage_when_asked(lit_run, octasplat, tmp_path):
+    stage = tmp_path / "stage.toml"
+    done = octasplat("stage", "init", lit_run, "-o", stage, "--copy-light")
+    assert done.exit_code == 0, done.output
+    assert 'file = "environment.exr"' in stage.read_text()
+    assert (tmp_path / "environment.exr").read_bytes() == (lit_run / "environment.exr").read_bytes()
+    # nobody's file is replaced
+    (tmp_path / "environment.exr").write_bytes(b"mine")
+    done = octasplat("stage", "init", lit_run, "-o", tmp_path / "other.toml", "--copy-light")
+    assert done.exit_code == 1 and "is there already" in done.stderr
+    assert (tmp_path / "environment.exr").read_bytes() == b"mine"
+
+
+def test_stage_init_job_puts_the_light_beside_the_stage(lit_run, tmp_path):
+    results = results_of("stage-init", lit_run, tmp_path / "attempt", {})
+    assert {path.name for path in results.iterdir()} == {"stage.toml", "environment.exr"}
+    read = read_stage(results / "stage.toml")
+    assert read.gaussians[0].light == "relit" and read.environment is not None
+    assert read.environment.file == "environment.exr" and read.environment.up == tuple(UP)
+    assert (results / "environment.exr").read_bytes() == (lit_run / "environment.exr").read_bytes()
+
+
+def test_stage_init_in_python_takes_the_light_of_the_run(lit_run, tmp_path):
+    osp.stage_init(lit_run, tmp_path / "stage.toml")
+    read = read_stage(tmp_path / "stage.toml")
+    assert read.gaussians[0].light == "relit" and read.environment is not None
+
+
+@pytest.mark.parametrize("case", ["file", "some", "near_field", "no_map"])
+def test_stage_init_says_why_materials_are_not_shown(lit_run, octasplat, tmp_path, case):
+    run = tmp_path / "run"
+    shutil.copytree(lit_run, run)
+    source, words = run, ""
+    if case == "file":
+        source, words = tmp_path / "alone.ply", "a file does not hold the light"
+        shutil.copy(run / "scene.ply", source)
+    elif case == "some":
+        words = "some of its Gaussians came from a scene without"
+        gaussians, _ = read_gaussian_ply(run / "scene.ply")
+        for values in gaussians.channels.values():
+            values[0] = 0
+        write_gaussian_ply(gaussians, run / "scene.ply")
+    elif case == "near_field":
+        words = "base colors hold the light of the photographs"
+        text = (run / "config.json").read_text().replace('"recipe": "split_sum"', '"recipe": "near_field"')
+        (run / "config.json").write_text(text)
+    else:
+        words = "the run holds no light"
+        for path in run.glob("environment.*"):
+            path.unlink()
+    done = octasplat("stage", "init", source, "-o", tmp_path / "stage.toml")
+    if case == "no_map" and done.exit_code:
+        assert "environment" in done.stderr and "Traceback" not in done.stderr
+        return
+    assert done.exit_code == 0, done.output
+    told = " ".join(done.stderr.split())
+    assert words in told and 'write light = "relit"' in told
+    read = read_stage(tmp_path / "stage.toml")
+    assert read.gaussians[0].light == "shadowed" and read.environment is None and len(read.lights) == 1
+    assert words in " ".join((tmp_path / "stage.toml").read_text().replace("\n# ", " ").split())
