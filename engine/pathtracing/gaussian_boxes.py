@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float32
 
+from octasplat.engine.gaussians.frames import rotation_matrices
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.morton import morton_order
 
@@ -29,13 +30,15 @@ def bounding_boxes(gaussians: FlatGaussians, q: float) -> Float32[np.ndarray, "6
     """
     if len(gaussians) == 0:
         return np.zeros((6, 0), np.float32)
-    means = gaussians.means_world.astype(np.float64)
-    legs = gaussians.rotations[:, :, 1:].astype(np.float64) * gaussians.scales.astype(np.float64)[:, None, :]
-    # the ellipse around the octagon
-    half = np.sqrt(q) * np.linalg.norm(legs, axis=2)
     boxes = []
     for part in np.array_split(morton_order(gaussians.means_world), min(MAX_BOXES, len(gaussians))):
-        low, high = (means[part] - half[part]).min(axis=0), (means[part] + half[part]).max(axis=0)
+        # a part at a time, as the rotations of all take gigabytes
+        means = gaussians.means_world[part].astype(np.float64)
+        scales = np.exp(gaussians.log_scales[part]).astype(np.float64)
+        legs = rotation_matrices(gaussians.quats_wxyz[part])[:, :, 1:] * scales[:, None, :]
+        # the ellipse around the octagon
+        half = np.sqrt(q) * np.linalg.norm(legs, axis=2)
+        low, high = (means - half).min(axis=0), (means + half).max(axis=0)
         margin = _MARGIN * max(np.abs(low).max(), np.abs(high).max())
         boxes.append(np.concatenate([low - margin, high + margin]))
     return np.stack(boxes, axis=1, dtype=np.float32)

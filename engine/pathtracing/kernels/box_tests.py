@@ -123,11 +123,11 @@ def end_paths_in_boxes(
     around = _box_around(boxes)
     found = np.int32(0)
     for row in range(count):
-        k = np.uintp(row)
-        p = np.uintp(bounce.active[k])
-        ray = make_ray(paths.origins_world[p], paths.directions_world[p])
-        comes_near = np.int32(_enters(ray, around, distances[k]))
-        rows[k] = comes_near
+        i = np.uintp(row)
+        q = np.uintp(bounce.active[i])
+        ray = make_ray(paths.origins_world[q], paths.directions_world[q])
+        comes_near = np.int32(_enters(ray, around, distances[i]))
+        rows[i] = comes_near
         found |= comes_near
     if found == 0:
         return False
@@ -164,14 +164,14 @@ def mark_shadows_in_boxes(
     around = _box_around(boxes)
     found = np.int32(0)
     for row in range(count):
-        k = np.uintp(row)
-        ray = make_ray(shadows.origins_world[k], shadows.directions_world[k])
-        radiance = shadows.radiance_linear[k]
+        i = np.uintp(row)
+        ray = make_ray(shadows.origins_world[i], shadows.directions_world[i])
+        radiance = shadows.radiance_linear[i]
         is_lit = (
             np.int32(radiance[0] != _ZERO) | np.int32(radiance[1] != _ZERO) | np.int32(radiance[2] != _ZERO)
         )
-        comes_near = is_lit & np.int32(_enters(ray, around, shadows.t_max[k]))
-        rows[k] = comes_near
+        comes_near = is_lit & np.int32(_enters(ray, around, shadows.t_max[i]))
+        rows[i] = comes_near
         found |= comes_near
     if found == 0:
         return False
