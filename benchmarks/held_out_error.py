@@ -48,14 +48,8 @@ from octasplat.engine.render.image_files import write_png
 from octasplat.engine.render.renderer import RenderedImage, background_color, render_rays
 from octasplat.engine.runs.config import read_config
 from octasplat.engine.runs.finished_shading import finished_shading, shown_options
-from octasplat.engine.runs.run_folder import (
-    CONFIG,
-    SCENE,
-    found_model_folder,
-    open_run_dataset,
-    photographs_folder,
-    run_extent,
-)
+from octasplat.engine.runs.run_dataset import open_run_dataset
+from octasplat.engine.runs.run_folder import CONFIG, SCENE, found_model_folder, photographs_folder, run_extent
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import Tracer

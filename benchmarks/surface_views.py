@@ -29,7 +29,8 @@ from octasplat.engine.render.image_files import write_png
 from octasplat.engine.render.renderer import background_color, render_rays
 from octasplat.engine.render.shots import gaussian_turntable, turntable_cameras
 from octasplat.engine.runs.config import read_config
-from octasplat.engine.runs.run_folder import CONFIG, SCENE, is_run, open_run_dataset, photographs_folder
+from octasplat.engine.runs.run_dataset import open_run_dataset
+from octasplat.engine.runs.run_folder import CONFIG, SCENE, is_run, photographs_folder
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import Tracer, TraceSettings
 from octasplat.engine.trace.triangle_bvh import TriangleBvh

@@ -9,10 +9,10 @@ import numpy as np
 from octasplat.engine.blocks.block_plan import Block
 from octasplat.engine.blocks.partition import Box
 from octasplat.engine.core import versions
+from octasplat.engine.core.archive_damage import ARCHIVE_DAMAGE
 from octasplat.engine.core.errors import CheckpointError
 from octasplat.engine.core.writing import atomic_replace
 from octasplat.engine.dataset.view_tiles import Rectangles
-from octasplat.engine.train.loop.checkpoint import ARCHIVE_DAMAGE
 
 PLAN_FILE = "plan.npz"
 COARSE, POLISH, FINISH = "coarse", "polish", "finish"

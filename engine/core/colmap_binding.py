@@ -5,12 +5,17 @@ handler that the program has set before is then not called any more, though Pyth
 training that is to end at a checkpoint when its machine is taken away would die at once. Import it so::
 
     from octasplat.engine.core.colmap_binding import pycolmap
+
+It is loaded when something of it is first asked for, as most commands never do.
 """
 
 import ctypes
 import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 _TAKEN = (
     signal.SIGTERM,
@@ -41,7 +46,24 @@ def _kept_signal_actions() -> Iterator[None]:
             sigaction(int(number), before[number], None)
 
 
-with _kept_signal_actions():
+class _Binding:
+    """Stands for the binding, and loads it."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+
+    def __getattr__(self, name: str) -> Any:
+        # One thread at a time: another would take the signals' actions for the program's.
+        with self._lock, _kept_signal_actions():
+            value = getattr(import_module("pycolmap"), name)
+        # found without this method from now on
+        setattr(self, name, value)
+        return value
+
+
+if TYPE_CHECKING:
     import pycolmap
+else:
+    pycolmap = _Binding()
 
 __all__ = ["pycolmap"]

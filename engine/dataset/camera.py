@@ -72,7 +72,7 @@ class Camera:
         """Return whether the image covers the whole sphere; other models cover only what lies ahead."""
         return self.model == "EQUIRECTANGULAR"
 
-    def to_pycolmap(self) -> pycolmap.Camera:
+    def to_pycolmap(self) -> "pycolmap.Camera":
         """Return the camera as a ``pycolmap.Camera``."""
         return pycolmap.Camera(
             model=self.model, width=self.width_px, height=self.height_px, params=list(self.params)
@@ -135,6 +135,6 @@ class Camera:
 
 
 @lru_cache(maxsize=4096)
-def _projector(camera: Camera) -> pycolmap.Camera:
+def _projector(camera: Camera) -> "pycolmap.Camera":
     """Return COLMAP's form of a camera to project with; making one takes as long as a thousand points."""
     return camera.to_pycolmap()

@@ -2,14 +2,16 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from jaxtyping import Int64
 
-from octasplat.engine.dataset.duplicates import Duplicates, find_duplicates
 from octasplat.engine.dataset.model import DatasetModel
 from octasplat.engine.dataset.split import split_views
+
+if TYPE_CHECKING:
+    from octasplat.engine.dataset.duplicates import Duplicates
 
 SplitSource = Literal["given", "every"]
 
@@ -51,6 +53,8 @@ def split_scene(model: DatasetModel, rule: SplitRule) -> SceneSplit:
         DatasetError: a name to hold out is unknown, or nothing is left to train on.
         ConfigError: ``test_every`` is negative.
     """
+    from octasplat.engine.dataset.duplicates import find_duplicates  # here, as it decodes photographs
+
     names = [view.name for view in model.views]
     if rule.stored is not None and rule.stored.keys() == set(names):
         return _stored_split(names, rule.stored, find_duplicates(model))
@@ -77,7 +81,7 @@ def split_scene(model: DatasetModel, rule: SplitRule) -> SceneSplit:
     return SceneSplit(train, test, tuple(warnings))
 
 
-def _stored_split(names: Sequence[str], stored: Mapping[str, bool], duplicates: Duplicates) -> SceneSplit:
+def _stored_split(names: Sequence[str], stored: Mapping[str, bool], duplicates: "Duplicates") -> SceneSplit:
     is_test = np.array([stored[name] for name in names], bool)
     apart = [group for group in duplicates.groups if len(set(is_test[list(group)].tolist())) == 2]
     if not apart:

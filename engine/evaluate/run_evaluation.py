@@ -29,6 +29,7 @@ from octasplat.engine.render.environment_files import read_environment
 from octasplat.engine.render.renderer import background_color
 from octasplat.engine.runs.config import ReconstructionConfig, read_config
 from octasplat.engine.runs.finished_shading import finished_shading, shown_options
+from octasplat.engine.runs.run_dataset import open_run_dataset
 from octasplat.engine.runs.run_folder import (
     CACHE,
     CONFIG,
@@ -39,7 +40,6 @@ from octasplat.engine.runs.run_folder import (
     VIEWS,
     found_model_folder,
     has_photographs_of_run,
-    open_run_dataset,
     other_poses_error,
     photographs_folder,
     run_environment,

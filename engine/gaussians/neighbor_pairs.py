@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int, Int64
-from scipy.spatial import KDTree
 
 from octasplat.engine.core.file_arrays import new_array
 from octasplat.engine.gaussians.flattening import row_slices
@@ -62,6 +61,8 @@ def _nearest(
     points: Float32[np.ndarray, "n 3"], folder: Path | None
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, "n k"]]:
     """Return an order in which points are near to those before, and of each point the nearest ones."""
+    from scipy.spatial import KDTree  # here, as most who import this module look for no pairs
+
     total = len(points)
     count = min(NEIGHBORS + 1, total)
     tree = KDTree(points)

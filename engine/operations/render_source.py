@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from jaxtyping import Float32
@@ -22,7 +22,6 @@ from octasplat.engine.operations.axes import axis_named
 from octasplat.engine.operations.render_options import PictureRequest
 from octasplat.engine.operations.scene_io import open_scene, open_scene_about
 from octasplat.engine.operations.written_files import check_targets
-from octasplat.engine.pathtracing.stage_scene import StageScene
 from octasplat.engine.render.orbit import (
     Orbit,
     PinholeLens,
@@ -35,8 +34,6 @@ from octasplat.engine.render.path_file import path_cameras
 from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.render.renderer import background_color
 from octasplat.engine.render.shots import Shot, gaussian_turntable, view_shots
-from octasplat.engine.runs.config import read_config
-from octasplat.engine.runs.finished_shading import finished_shading, shown_options
 from octasplat.engine.runs.run_folder import (
     CONFIG,
     SCENE,
@@ -45,16 +42,13 @@ from octasplat.engine.runs.run_folder import (
     run_min_view_distance,
     run_viewpoints,
 )
-from octasplat.engine.shading.background import LearnedBackground
-from octasplat.engine.shading.deferred import DeferredShading
-from octasplat.engine.shading.residual_colors import ResidualColors
 from octasplat.engine.trace.protocol import TraceSettings
-from octasplat.engine.train.shading_factory import (
-    ShadingOptions,
-    find_background,
-    find_deferred,
-    find_residual,
-)
+
+if TYPE_CHECKING:
+    from octasplat.engine.pathtracing.stage_scene import StageScene
+    from octasplat.engine.shading.background import LearnedBackground
+    from octasplat.engine.shading.deferred import DeferredShading
+    from octasplat.engine.shading.residual_colors import ResidualColors
 
 _NO_LIGHT = "a file does not hold the light that its materials were learnt in."
 _SOME_WITHOUT = "some of its Gaussians came from a scene without materials, so that harmonics are shown."
@@ -91,9 +85,9 @@ class RenderSource:
     max_side: int | None = None
     trained_rad: float = 0.0
     trained_extent: float | None = None
-    learnt: LearnedBackground | None = None
-    materials: DeferredShading | None = None
-    residual: ResidualColors | None = None
+    learnt: "LearnedBackground | None" = None
+    materials: "DeferredShading | None" = None
+    residual: "ResidualColors | None" = None
     photographs: Viewpoints | None = None
     origin_world: Origin = NO_ORIGIN
 
@@ -154,6 +148,29 @@ def read_render_source(
             trained_rad=facts.pixel_rad,
             origin_world=facts.origin_world,
         )
+    return _read_run(source, progress, dataset, max_side, full_size=full_size, shading=shading)
+
+
+def _read_run(
+    source: Path,
+    progress: EventListener,
+    dataset: Path | None,
+    max_side: int | None,
+    *,
+    full_size: bool,
+    shading: Literal["materials", "harmonics"] | None,
+) -> RenderSource:
+    """Read the folder of a run, see :func:`read_render_source`."""
+    # here, as a file has no settings and no shading of its own
+    from octasplat.engine.runs.config import read_config
+    from octasplat.engine.runs.finished_shading import finished_shading, shown_options
+    from octasplat.engine.train.shading_factory import (
+        ShadingOptions,
+        find_background,
+        find_deferred,
+        find_residual,
+    )
+
     config = read_config(source / CONFIG)
     if not (source / SCENE).exists():
         raise OutputError(
@@ -315,7 +332,7 @@ def stage_scene(
     progress: EventListener,
     *,
     threads: int = 0,
-) -> StageScene:
+) -> "StageScene":
     """Return the scene for a stage.
 
     Args:
@@ -325,6 +342,8 @@ def stage_scene(
         progress: receives what reading files of the stage loses.
         threads: to use; 0 takes all.
     """
+    from octasplat.engine.pathtracing.stage_scene import StageScene  # here, as most renders have no stage
+
     return StageScene(
         gaussians=source.gaussians,
         settings=source.settings,
@@ -341,7 +360,7 @@ def stage_scene(
 
 def open_stage_scene(
     source: Path, progress: EventListener, *, dataset: Path | None = None, threads: int = 0
-) -> StageScene:
+) -> "StageScene":
     """Read a run or a file as the scene for a stage.
 
     Args:

@@ -10,7 +10,6 @@ from pydantic import BaseModel
 
 from octasplat.engine.core.events import EventListener, Noted, Warned
 from octasplat.engine.core.local_origin import Origin, describe_origin
-from octasplat.engine.edit.changed_run import check_new_run, write_edited_run
 from octasplat.engine.files import (
     ExportOptions,
     dropped_on_export,
@@ -180,6 +179,8 @@ def check_edited_output(
         SceneFileError: no format takes the name.
     """
     if is_run_output(request.source, output):
+        from octasplat.engine.edit.changed_run import check_new_run  # here, as most who read scenes edit none
+
         check_new_run(output)
     else:
         check_scenes(verb, [output], [request.source, *inputs], overwrite=request.overwrite)
@@ -229,6 +230,8 @@ def write_edited_scene(
         return WrittenScene(
             (output,), write_scene(gaussians, facts or read_metadata(source), output, progress)
         )
+    from octasplat.engine.edit.changed_run import write_edited_run  # here, as most who read scenes edit none
+
     for warning in write_edited_run(source, gaussians, output, edit_record, facts=facts, matrix=matrix):
         progress(Warned(warning))
     files = tuple(sorted(path for path in output.rglob("*") if path.is_file()))

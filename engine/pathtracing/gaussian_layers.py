@@ -110,7 +110,8 @@ def build_gaussian_layers(
     if not parts:
         return None
     # Channels say nothing of light, and two scenes may mean different things by one name.
-    merged = merge_scenes([part.without_channels(tuple(part.channels)) for part in parts])
+    plain = [part.without_channels(tuple(part.channels)) for part in parts]
+    merged = plain[0] if len(plain) == 1 else merge_scenes(plain)
     tracer = make_tracer(settings, threads=threads, build_quality=2)
     columns = FEATURE_COUNT if any(surfaces) else BASE_FEATURE_COUNT
     tracer.build(merged, np.ascontiguousarray(np.concatenate(features)[:, :columns]))

@@ -14,7 +14,7 @@ from octasplat.engine.pathtracing.kernels.path_args import GaussianBoxes, PathBl
 from octasplat.engine.pathtracing.kernels.trace_paths import trace_paths
 from octasplat.engine.pathtracing.path_batches import allocate_path_block, pixels_per_batch
 
-NO_BOXES = GaussianBoxes(np.zeros((0, 6), np.float32), np.zeros((0, 6), np.float32))
+NO_BOXES = GaussianBoxes(np.zeros((6, 0), np.float32), np.zeros((6, 0), np.float32))
 INFINITE_T_MAX = np.full(1, np.inf, np.float32)
 
 

@@ -4,9 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial.transform import Rotation
 
 from octasplat.engine.pathtracing.kernels.smooth_normals import smooth_normals
 from octasplat.engine.pathtracing.mesh_files import WELD_TOLERANCE, MeshShape, weld_vertices
@@ -72,10 +69,13 @@ def up_axis_rotation(
     axis: str, degrees: float, up_world: Float64[np.ndarray, "3"]
 ) -> Float64[np.ndarray, "3 3"]:
     """Return :func:`align_axis_to_up` followed by a rotation about up, anticlockwise seen from above."""
+    aligned = align_axis_to_up(axis, up_world)
+    if degrees == 0:
+        return aligned
+    from scipy.spatial.transform import Rotation  # here, as most meshes are not turned
+
     up = up_world / np.linalg.norm(up_world)
-    return np.asarray(
-        Rotation.from_rotvec(np.radians(degrees) * up).as_matrix() @ align_axis_to_up(axis, up_world)
-    )
+    return np.asarray(Rotation.from_rotvec(np.radians(degrees) * up).as_matrix() @ aligned)
 
 
 def transform_points(
@@ -158,6 +158,9 @@ def turn_outwards(shape: MeshShape, face_mask: Bool[np.ndarray, " f"]) -> MeshSh
 
 def _faces_inwards(shape: MeshShape, face_mask: Bool[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
     """Return the faces of solids that face inwards, or that lie within such a one."""
+    from scipy.sparse import coo_array  # here, as most meshes are no solids of glass
+    from scipy.sparse.csgraph import connected_components
+
     faces = shape.faces[face_mask]
     owner = weld_vertices(shape.vertices)
     edges = owner[faces[:, [0, 1, 1, 2]]].reshape(-1, 2).T

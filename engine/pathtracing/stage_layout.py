@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
-from scipy.spatial import cKDTree
 
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians
@@ -62,6 +61,8 @@ def estimate_stage_layout(
     visibility = _visibility(tracer, cameras_world, spots + above)
     free = np.full(len(spots), 0.3 * size)
     if len(standing):
+        from scipy.spatial import cKDTree  # here, as every render imports this module
+
         free = np.minimum(cKDTree(standing).query(spots)[0], free)
     away = np.linalg.norm(spots - centre_world, axis=1)
     floor = spots[np.argmax(size * visibility + free - 0.7 * away)]

@@ -12,11 +12,9 @@ from octasplat.engine.core.local_origin import NO_ORIGIN, Origin, is_set
 from octasplat.engine.dataset.model import Viewpoints
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.pathtracing.stage.stage_template import StageLayout
-from octasplat.engine.pathtracing.stage_layout import estimate_stage_layout
 from octasplat.engine.pathtracing.stage_origin import places_note
 from octasplat.engine.render.pose_paths import Turntable
 from octasplat.engine.render.shots import gaussian_turntable, turntable_of_views
-from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import TraceSettings
 
 SIZE_PER_RADIUS = 0.4
@@ -93,6 +91,10 @@ def first_stage_layout(scene: StageScene, up_world: Float64[np.ndarray, "3"] | N
     Raises:
         ConfigError: the cameras of the photographs share no up direction.
     """
+    # here, as every stage imports this module, and few of them are the first
+    from octasplat.engine.pathtracing.stage_layout import estimate_stage_layout
+    from octasplat.engine.trace.factory import make_tracer
+
     table = scene.turntable(up_world)
     if scene.photographs is None:
         cameras = table.poses(LAYOUT_CAMERAS)[:, :3, 3]

@@ -28,7 +28,8 @@ from octasplat.engine.core.progress import phase
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.dataset.dataset_part import photograph_facts
 from octasplat.engine.pipeline.run import ReconstructionRun
-from octasplat.engine.runs.run_folder import BLOCKS, CACHE, SCENE, found_model_folder, open_run_dataset
+from octasplat.engine.runs.run_dataset import open_run_dataset
+from octasplat.engine.runs.run_folder import BLOCKS, CACHE, SCENE, found_model_folder
 from octasplat.engine.train.views.exposure_changes import resolve_exposure
 
 

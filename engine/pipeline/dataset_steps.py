@@ -15,6 +15,7 @@ from octasplat.engine.pipeline.run import ReconstructionRun, run_steps
 from octasplat.engine.pipeline.start_scene import check_start, has_start
 from octasplat.engine.poses.photographs import notes_on_files
 from octasplat.engine.runs.config import read_config
+from octasplat.engine.runs.run_dataset import open_run_dataset, open_run_part
 from octasplat.engine.runs.run_folder import (
     BLOCKS,
     CONFIG,
@@ -22,8 +23,6 @@ from octasplat.engine.runs.run_folder import (
     VIEWS,
     dataset_folder_of_run,
     found_model_folder,
-    open_run_dataset,
-    open_run_part,
 )
 from octasplat.engine.runs.run_poses import (
     estimate_principal_points,

@@ -1,6 +1,7 @@
 """Visible bounds of a scene, and the camera distance at which they fit into an image."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -107,16 +108,19 @@ def _robust_range(
     values: Float64[np.ndarray, " n"], reach: Float64[np.ndarray, " n"], weights: Float64[np.ndarray, " n"]
 ) -> tuple[float, float]:
     """Return the range of all values but the tails, each value extended by a standard deviation."""
-    low, high = values - reach, values + reach
-    return _weighted_quantile(low, weights, _TAIL_QUANTILE), _weighted_quantile(
-        high, weights, 1 - _TAIL_QUANTILE
-    )
+    low = _end_of_tail(values - reach, weights, "left")
+    # the largest value of all that have no more than the tail above them
+    return low, -_end_of_tail(-values - reach, weights, "right")
 
 
-def _weighted_quantile(
-    values: Float64[np.ndarray, " n"], weights: Float64[np.ndarray, " n"], quantile: float
+def _end_of_tail(
+    values: Float64[np.ndarray, " n"], weights: Float64[np.ndarray, " n"], side: Literal["left", "right"]
 ) -> float:
-    order = np.argsort(values)
+    """Return the value up to which the weights come to those of a tail."""
+    tail, least = _TAIL_QUANTILE * float(weights.sum()), float(weights.min())
+    # no more can be part of it, so that no others are sorted
+    count = int(min(tail / least + 2, len(values))) if least > 0 else len(values)
+    some = np.argpartition(values, count - 1)[:count]
+    order = some[np.argsort(values[some])]
     sums = np.cumsum(weights[order])
-    # Rounding may put the quantile beyond the last sum.
-    return float(values[order[min(int(np.searchsorted(sums, quantile * sums[-1])), len(order) - 1)]])
+    return float(values[order[min(int(np.searchsorted(sums, tail, side)), count - 1)]])

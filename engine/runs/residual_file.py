@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32
 
+from octasplat.engine.core.archive_damage import ARCHIVE_DAMAGE
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.writing import atomic_replace
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.runs.run_folder import RESIDUAL
-from octasplat.engine.train.loop.checkpoint import ARCHIVE_DAMAGE
 
 COEFFICIENT_COUNTS = (1, 4, 9, 16)
 """Coefficients of harmonics of degree 0 to 3."""

@@ -1,33 +1,24 @@
-"""Run folder: the names of its files, and the photographs and cameras of the run."""
+"""Run folder: the names of its files, and the cameras of the run."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from octasplat.engine.core.errors import ConfigError, DatasetError
-from octasplat.engine.core.events import EventListener, Noted, PhaseProgress, Warned
 from octasplat.engine.core.local_origin import Origin
-from octasplat.engine.dataset import Dataset, load_dataset_model
 from octasplat.engine.dataset.camera_clearance import CameraClearance
-from octasplat.engine.dataset.dataset_part import open_dataset_part
-from octasplat.engine.dataset.image_names import match_image_names
-from octasplat.engine.dataset.model_sources import has_model
-from octasplat.engine.dataset.photograph_facts import PhotographFacts
-from octasplat.engine.dataset.photograph_files import image_folder, photographs_below
-from octasplat.engine.dataset.pixel_cache import file_sha256, has_former_cache
-from octasplat.engine.dataset.region import Region
 from octasplat.engine.dataset.scene_split import SplitRule
-from octasplat.engine.dataset.view_frusta import ViewFrusta
-from octasplat.engine.dataset.views_file import SplitViewpoints, ViewsRecord, read_views, scene_viewpoints
+from octasplat.engine.dataset.views_file import SplitViewpoints, read_views, scene_viewpoints
 from octasplat.engine.files import read_metadata
 from octasplat.engine.runs.config import ReconstructionConfig, read_config
-from octasplat.engine.runs.geometry_file import find_known_geometry
-from octasplat.engine.shading.exposure import ExposuresByName
-from octasplat.engine.train.config import min_tile_side_px
+
+if TYPE_CHECKING:
+    from octasplat.engine.shading.exposure import ExposuresByName
 
 CONFIG, EVENTS, HELD_OUT, SCENE, TRAINING, VIEWS = (
     "config.json", "events.jsonl", "held_out.json", "scene.ply", "training.json", "views.json",
@@ -126,6 +117,8 @@ def run_viewpoints(
     max_side = max_side or config.max_side
     if scene is None and (output / VIEWS).exists():  # no photographs are needed
         return read_views(output / VIEWS).viewpoints(max_side)
+    from octasplat.engine.dataset.load import load_dataset_model  # here, as most runs keep their cameras
+
     folder = photographs_folder(output, scene)
     model_folder, model = model_of_photographs(output, folder, config)
     photographs = load_dataset_model(
@@ -222,11 +215,13 @@ def run_seen_test(
         scene = read_views(output / VIEWS).viewpoints(None)
     except (OSError, ConfigError):
         return None
+    from octasplat.engine.dataset.view_frusta import ViewFrusta  # here, as it loads kernels
+
     frusta = ViewFrusta.from_views(scene, scene.train_indices)
     return partial(frusta.contains_often, count=min(min_views, len(frusta.views)))
 
 
-def run_exposures(output: Path) -> ExposuresByName | None:
+def run_exposures(output: Path) -> "ExposuresByName | None":
     """Return the learnt exposures of a finished run by view name; None if it has none."""
     try:
         known: ExposuresByName | None = json.loads((output / TRAINING).read_text("utf-8")).get("exposures")
@@ -267,6 +262,11 @@ def has_photographs_of_run(output: Path, folder: Path) -> bool:
     Raises:
         ConfigError: ``output`` is no run.
     """
+    # here, as this one alone reads photographs
+    from octasplat.engine.dataset.image_names import match_image_names
+    from octasplat.engine.dataset.photograph_files import image_folder, photographs_below
+    from octasplat.engine.dataset.pixel_cache import file_sha256
+
     if folder.resolve() == dataset_folder_of_run(output):
         return True
     if not (output / VIEWS).exists():
@@ -297,122 +297,7 @@ def model_of_photographs(
     Raises:
         ConfigError: ``output`` is no run.
     """
+    from octasplat.engine.dataset.model_sources import has_model
+
     is_other = (output / VIEWS).exists() and has_model(folder) and not has_photographs_of_run(output, folder)
     return (None, None) if is_other else (found_model_folder(output), config.model)
-
-
-def _region(config: ReconstructionConfig) -> Region | None:
-    if config.region is None:
-        return None
-    return Region(config.region, min_tile_side_px(config.train))
-
-
-def open_run_dataset(
-    scene: Path,
-    output: Path,
-    config: ReconstructionConfig,
-    threads: int,
-    progress: EventListener,
-    *,
-    model_folder: Path | None = None,
-    check_views: Callable[[ViewsRecord], None] | None = None,
-    cache: Path | None = None,
-) -> Dataset:
-    """Open the photographs of a run with its settings, ready for training or evaluation.
-
-    Args:
-        scene: folder of the photographs.
-        output: folder of the run, which holds the cache.
-        config: of the run.
-        threads: for decoding; 0 takes all cores.
-        progress: receives the progress events, and what is odd but usable.
-        model_folder: of poses that were found, see :func:`found_model_folder`.
-        check_views: called with the record of the views before any photograph is decoded; raises to reject
-            the dataset.
-        cache: folder of the decoded photographs; None takes that of the run.
-
-    Raises:
-        DatasetError: the photographs cannot be used.
-        OutputError: the cache cannot be written.
-    """
-    cache = cache or output / CACHE
-    if has_former_cache(cache):
-        progress(Noted(f"{cache} is of a version with other results, so photographs are decoded again."))
-    dataset = Dataset.open(
-        scene,
-        cache,
-        max_side=config.max_side,
-        test_every=config.test_every,
-        held_out=config.held_out,
-        burst_length=config.burst_length,
-        split=config.split,
-        stored_split=stored_split(output),
-        masks=config.masks,
-        model_folder=model_folder,
-        model=config.model,
-        check_views=check_views,
-        near=config.train.near,
-        origin_world=run_origin(output),
-        region=_region(config),
-        depth_unit=config.depth_unit,
-        geometry=find_known_geometry(scene),
-        threads=threads,
-        progress=lambda done, total: progress(PhaseProgress("load", done, total)),
-    )
-    _tell_what_is_odd(dataset, config, progress)
-    return dataset
-
-
-def open_run_part(
-    scene: Path,
-    output: Path,
-    config: ReconstructionConfig,
-    threads: int,
-    progress: EventListener,
-    views: Sequence[int],
-    facts: PhotographFacts,
-    *,
-    check_views: Callable[[ViewsRecord], None] | None = None,
-) -> Dataset:
-    """Open some of the photographs of a run that goes on; the others need not be there.
-
-    Args:
-        scene: folder of the photographs, in which files of the others may be empty.
-        output: folder of the run, which holds its views and the cache.
-        config: of the run.
-        threads: for decoding; 0 takes all cores.
-        progress: receives the progress events, and what is odd but usable.
-        views: indices of those to open, ascending.
-        facts: on all photographs.
-        check_views: see :func:`open_run_dataset`.
-
-    Raises:
-        DatasetError: the photographs cannot be used.
-        CheckpointError: the scene has other photographs than the facts are on.
-        OutputError: the cache cannot be written.
-    """
-    dataset = open_dataset_part(
-        scene,
-        output / CACHE,
-        np.array(views, np.int64),
-        facts,
-        read_views(output / VIEWS),
-        max_side=config.max_side,
-        masks=config.masks,
-        model_folder=found_model_folder(output),
-        model=config.model,
-        near=config.train.near,
-        geometry=find_known_geometry(scene),
-        check_views=check_views,
-        threads=threads,
-        progress=lambda done, total: progress(PhaseProgress("load", done, total)),
-    )
-    _tell_what_is_odd(dataset, config, progress)
-    return dataset
-
-
-def _tell_what_is_odd(dataset: Dataset, config: ReconstructionConfig, progress: EventListener) -> None:
-    for warning in dataset.warnings:
-        progress(Warned(warning))
-    if (mismatch := config.background_mismatch(dataset.has_alpha)) is not None:
-        progress(Warned(mismatch))

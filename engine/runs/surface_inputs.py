@@ -16,12 +16,12 @@ from octasplat.engine.files import read_metadata
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.runs.config import read_config
+from octasplat.engine.runs.run_dataset import open_run_dataset
 from octasplat.engine.runs.run_folder import (
     CONFIG,
     VIEWS,
     is_run,
     model_of_photographs,
-    open_run_dataset,
     photographs_folder,
     run_exposures,
     run_min_view_distance,

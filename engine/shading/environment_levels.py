@@ -9,7 +9,6 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int32, Int64
-from scipy.sparse import csr_matrix
 
 from octasplat.engine.core.compilation import run_ranges
 from octasplat.engine.core.errors import ConfigError
@@ -39,6 +38,8 @@ class _SparseRows:
         )  # fmt: skip
 
     def transpose(self, columns: int) -> "_SparseRows":
+        from scipy.sparse import csr_matrix  # here, as every render imports this module
+
         shape = (len(self.starts) - 1, columns)
         transposed = csr_matrix((self.weights, self.columns, self.starts), shape).T.tocsr()
         transposed.sort_indices()

@@ -10,7 +10,6 @@ something else: see :mod:`octasplat.engine.shading.ref_gaussian`.
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.spatial import cKDTree
 
 from octasplat.engine.gaussians.frames import quaternions_from_matrices
 from octasplat.engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS
@@ -32,6 +31,8 @@ def propagate_normals(gaussians: FlatGaussians) -> None:
 
     Neighbours count by opacity, nearness, likeness, and how well their material shows which way they face.
     """
+    from scipy.spatial import cKDTree  # here, as every render imports this module
+
     means = gaussians.means_world.astype(np.float64)
     frames = gaussians.rotations.astype(np.float64)
     normals = frames[:, :, 0]

@@ -12,8 +12,10 @@ asked = []
 signal.signal(signal.SIGTERM, lambda *_: asked.append("SIGTERM"))
 faulthandler.enable()
 import octasplat as osp
+from octasplat.engine.core.colmap_binding import pycolmap
 def estimate():
     osp.estimate("photos", preset="fast", max_side=48)
+    assert pycolmap.Camera  # loaded now, if it was not before
 thread = threading.Thread(target=estimate)
 if sys.argv[1] == "thread":
     thread.start()

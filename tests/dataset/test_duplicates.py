@@ -9,7 +9,7 @@ import pytest
 from octasplat.engine.dataset import Dataset, split_views
 from octasplat.engine.dataset.views_file import ViewsRecord, read_views, write_views
 from octasplat.engine.runs.config import ReconstructionConfig
-from octasplat.engine.runs.run_folder import open_run_dataset
+from octasplat.engine.runs.run_dataset import open_run_dataset
 
 Images = list[tuple[str, int, np.ndarray]]
 

@@ -8,7 +8,7 @@ from octasplat.engine.core.events import Event, Warned
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.runs.config import ReconstructionConfig, read_config, resolve_config
-from octasplat.engine.runs.run_folder import open_run_dataset
+from octasplat.engine.runs.run_dataset import open_run_dataset
 
 
 @pytest.mark.parametrize(

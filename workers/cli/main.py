@@ -17,6 +17,7 @@ from typing import Any, NoReturn, TextIO
 import click
 
 from octasplat.engine.core.errors import OctasplatError
+from octasplat.workers.cli.collector import rare_collections
 from octasplat.workers.cli.signals import StoppedError
 
 # Threads that wait for each other sleep instead of spinning: no slower alone, several times faster on a
@@ -124,7 +125,8 @@ class _LazyGroup(click.Group):
         """Return the command of that name, imported now; None if there is none."""
         if cmd_name not in _COMMANDS:
             return super().get_command(ctx, cmd_name)
-        module = import_module(f"octasplat.workers.cli.commands.{_COMMANDS[cmd_name][0]}")
+        with rare_collections():
+            module = import_module(f"octasplat.workers.cli.commands.{_COMMANDS[cmd_name][0]}")
         commands = (value for value in vars(module).values() if isinstance(value, click.Command))
         return next(command for command in commands if command.name == cmd_name)
 

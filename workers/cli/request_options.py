@@ -21,6 +21,7 @@ from octasplat.engine.operations.base import (
 from octasplat.engine.operations.written_files import remember_written
 from octasplat.engine.settings.fields import Positional, Spelling, is_negatable
 from octasplat.engine.settings.renamed_settings import former_names, notify_renamed
+from octasplat.workers.cli.collector import rare_collections
 from octasplat.workers.cli.input_paths import check_inputs
 from octasplat.workers.cli.option_types import (
     ValueChoice,
@@ -146,23 +147,43 @@ def run_operation(
         StoppedError: a signal asked to stop.
     """
     if is_stoppable:
-        with request_stop_on_signals() as should_stop:
+        with request_stop_on_signals() as should_stop, rare_collections() as end_start:
             try:
                 with show_progress(quiet=printer.hides_progress, should_stop=should_stop) as progress:
                     listener = (
                         progress if printer.hides_progress else _with_first_sentence(progress, first_sentence)
                     )
+                    listener = _at_first_event(end_start, listener)
                     result = operation.execute(
                         request, progress=listener, should_stop=should_stop, threads=threads
                     )
             except CancelledError as error:
                 raise StoppedError(str(error), should_stop.exit_code) from None
     else:
-        with exit_on_sigterm(), show_progress(quiet=printer.hides_progress) as progress:
-            result = operation.execute(request, progress=progress, should_stop=never_stop, threads=threads)
+        with (
+            exit_on_sigterm(),
+            rare_collections() as end_start,
+            show_progress(quiet=printer.hides_progress) as progress,
+        ):
+            listener = _at_first_event(end_start, progress)
+            result = operation.execute(request, progress=listener, should_stop=never_stop, threads=threads)
     remember_written(operation.name, result.files)
     printer.print(result, result.lines())
     return result
+
+
+def _at_first_event(act: Callable[[], None], progress: EventListener) -> EventListener:
+    """Return a listener that acts before the first event: what the work needs is imported by then."""
+    has_begun = False
+
+    def listen(event: Event) -> None:
+        nonlocal has_begun
+        if not has_begun:
+            has_begun = True
+            act()
+        progress(event)
+
+    return listen
 
 
 def _with_first_sentence(progress: EventListener, first_sentence: Callable[[], str | None]) -> EventListener:

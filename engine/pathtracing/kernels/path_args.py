@@ -243,15 +243,15 @@ class PathStart(NamedTuple):
 
 
 class GaussianBoxes(NamedTuple):
-    """Boxes around Gaussians, each its least and its greatest corner; none where there are no Gaussians.
+    """Boxes around Gaussians, a column each: least corner, greatest corner; none without Gaussians.
 
     Attributes:
         all: around all of them.
         casting_shadows: around those that cast shadows on meshes.
     """
 
-    all: Float32[np.ndarray, "b 6"]
-    casting_shadows: Float32[np.ndarray, "c 6"]
+    all: Float32[np.ndarray, "6 b"]
+    casting_shadows: Float32[np.ndarray, "6 c"]
 
 
 class PathBlock(NamedTuple):

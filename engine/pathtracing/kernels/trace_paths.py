@@ -70,12 +70,12 @@ def trace_paths(
             if queries.any_cutout or scene.any_nested:
                 pass_surfaces(0, left, scratch, queries, bounce)
             any_enters = False
-            if len(boxes.all) > 0:
-                any_enters = end_paths_in_boxes(boxes.all, bounce, left, each, enters)
+            if boxes.all.shape[1] > 0:
+                any_enters = end_paths_in_boxes(boxes.all, bounce, left, each, scratch.rows, enters)
             # --- surfaces, and light that reaches them ---
             shade_surfaces(0, left, scratch, bounce)
-            if len(boxes.casting_shadows) > 0 and mark_shadows_in_boxes(
-                boxes.casting_shadows, bounce, left, each, enters
+            if boxes.casting_shadows.shape[1] > 0 and mark_shadows_in_boxes(
+                boxes.casting_shadows, bounce, left, each, scratch.rows, enters
             ):
                 any_enters = True
             shadow_transmittance(

@@ -2,9 +2,6 @@
 
 import hashlib
 import json
-import struct
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from octasplat.engine.core import versions
+from octasplat.engine.core.archive_damage import ARCHIVE_DAMAGE
 from octasplat.engine.core.errors import CheckpointError, DamagedCheckpointError
 from octasplat.engine.core.events import EventListener, Warned
 from octasplat.engine.core.writing import atomic_replace
@@ -30,11 +28,6 @@ CHECKPOINT_FORMAT = 6
 KEPT_CHECKPOINTS = 2
 _PREFIX, _BEST = "iteration_", "best.npz"
 _GROUPS = ("gaussians", "adam", "average", "densifier", "shading", "poses")
-ARCHIVE_DAMAGE = (
-    OSError, KeyError, ValueError, TypeError, AttributeError, EOFError, RuntimeError, MemoryError,
-    OverflowError, struct.error, zlib.error, zipfile.BadZipFile,
-)  # fmt: skip
-"""What reading a damaged archive may raise; a flipped bit can ask for encryption or a lengthy array."""
 
 
 def run_fingerprint(dataset: Dataset, config: TrainConfig) -> str:

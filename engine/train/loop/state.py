@@ -4,7 +4,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float64, Int64
-from scipy.spatial import cKDTree
 
 from octasplat.engine.dataset.model import Viewpoints
 from octasplat.engine.gaussians.model import FlatGaussians
@@ -101,6 +100,8 @@ class MinScale:
 
     def apply(self, gaussians: FlatGaussians) -> None:
         """Raise the scales that are smaller, in place."""
+        from scipy.spatial import cKDTree  # here, as every render imports this module
+
         # the nearest camera shows the finest detail
         distance = cKDTree(self.origins_world).query(gaussians.means_world)[0]
         least = np.log(np.maximum(self.angle_rad * distance, 1e-12)).astype(np.float32)
