@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from octasplat.engine.pathtracing.stage.base import (
+    IS_NUMBER,
     WHITE,
     Color,
     Finite,
@@ -80,7 +81,7 @@ class StageMesh(Transformed):
     shape: Literal["sphere", "cube", "plane"] | None = None
     up_axis: Literal["world", "x", "-x", "y", "-y", "z", "-z"] | None = None
     turn_degrees: Finite = 0.0
-    smooth_degrees: Annotated[float, Field(ge=0, le=180)] | None = None
+    smooth_degrees: Annotated[float, Field(ge=0, le=180), IS_NUMBER] | None = None
     material: Material | None = None
     on: RestingPlace | None = None
     keys: Keys[MeshKey] = ()
@@ -155,8 +156,8 @@ class SpotLight(LightModel):
     position: Vector
     direction: Vector
     intensity: NonNegative
-    outer_degrees: Annotated[float, Field(gt=0, lt=90)] = 30.0
-    inner_degrees: Annotated[float, Field(ge=0, lt=90)] = 20.0
+    outer_degrees: Annotated[float, Field(gt=0, lt=90), IS_NUMBER] = 30.0
+    inner_degrees: Annotated[float, Field(ge=0, lt=90), IS_NUMBER] = 20.0
 
     @model_validator(mode="after")
     def _check_cone(self) -> "SpotLight":
@@ -292,13 +293,13 @@ class Integrator(StageModel):
             colors stay as they are. Needs the extra ``denoise``.
     """
 
-    samples: Annotated[int, Field(ge=1, le=65536)] = 16
-    max_depth: Annotated[int, Field(ge=1, le=64)] = 8
-    roulette_depth: Annotated[int, Field(ge=1, le=64)] = 4
-    seed: Annotated[int, Field(ge=0, lt=1 << 31)] = 0
+    samples: Annotated[int, Field(ge=1, le=65536), IS_NUMBER] = 16
+    max_depth: Annotated[int, Field(ge=1, le=64), IS_NUMBER] = 8
+    roulette_depth: Annotated[int, Field(ge=1, le=64), IS_NUMBER] = 4
+    seed: Annotated[int, Field(ge=0, lt=1 << 31), IS_NUMBER] = 0
     anti_aliasing: bool = True
     clamp: Positive | None = None
-    exposure: Annotated[float, Field(ge=-20, le=20)] = 0.0
+    exposure: Annotated[float, Field(ge=-20, le=20), IS_NUMBER] = 0.0
     tone: Literal["none", "reinhard", "filmic"] = "none"
     aperture: NonNegative = 0.0
     focus_distance: Positive | None = None
@@ -325,7 +326,7 @@ class Stage(StageModel):
         integrator: how the picture is computed.
     """
 
-    version: Literal[1] = 1
+    version: Annotated[Literal[1], IS_NUMBER] = 1
     up: Vector = (0.0, -1.0, 0.0)
     gaussians: Annotated[tuple[StageGaussians, ...], Field(max_length=MAX_SCENES)] = (StageGaussians(),)
     meshes: Annotated[tuple[StageMesh, ...], Field(max_length=MAX_MESHES)] = ()
