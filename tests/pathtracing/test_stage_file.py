@@ -59,7 +59,7 @@ def test_stage_file_with_all_keys_is_read(tmp_path: Path) -> None:
         """
     )
     stage = read_stage(tmp_path / "stage.toml")
-    assert [scene.light for scene in stage.gaussians] == ["relit", "shadowed"]
+    assert [scene.light for scene in stage.gaussians] == ["relit", None]
     assert isinstance(stage.meshes[0].material, MetallicRoughness)
     assert stage.meshes[1].material == Glass(ior=1.33, absorption=(1, 0, 0))
     assert isinstance(stage.lights[0], PointLight) and stage.integrator.samples == 4
@@ -277,7 +277,10 @@ def test_reading_stages_needs_neither_torch_nor_numba() -> None:
 
 
 def test_stage_default_scene_mode() -> None:
-    assert Stage().gaussians[0].light == "shadowed"
+    assert Stage().gaussians[0].light is None
+    # services and workers of former versions take no null
+    assert "light" not in Stage().model_dump(mode="json")["gaussians"][0]
+    assert StageGaussians(light="shadowed").model_dump(mode="json")["light"] == "shadowed"
 
 
 def test_example_stages_are_valid(tmp_path: Path) -> None:

@@ -250,7 +250,9 @@ class StageGaussians(Transformed):
         light: ``emissive`` shows the trained colors as they are; ``shadowed`` takes from them what the
             meshes keep off of the stage's lights, and adds the light of those that add theirs, and of meshes
             that shine; ``relit`` takes them as the albedo of a matt surface with
-            the octagons' normals that the stage's lights shine on.
+            the octagons' normals that the stage's lights shine on, or shows the materials of a scene that has
+            some. None is ``relit`` for the scene of a run whose materials can be lit, by the stage's
+            environment or by the light that the run has learnt, and else ``shadowed``.
         ambient: share of the trained color that is there without the stage's lights (shadowed, relit).
         shadows_on_meshes: whether they keep light off the meshes.
         shadows_on_gaussians: whether they keep light off the Gaussians. Trained colors hold the scene's
@@ -260,7 +262,10 @@ class StageGaussians(Transformed):
     """
 
     file: str | None = None
-    light: Literal["emissive", "shadowed", "relit"] = "shadowed"
+    # not written where it is not given: former versions, of services and of workers, take no null
+    light: Literal["emissive", "shadowed", "relit"] | None = Field(
+        None, exclude_if=lambda light: light is None
+    )
     ambient: UnitInterval = 0.4
     shadows_on_meshes: bool = True
     shadows_on_gaussians: bool = False
@@ -339,7 +344,7 @@ class Stage(StageModel):
     def _check_shadows_fall(cls, lights: tuple[Light, ...], info: Any) -> tuple[Light, ...]:
         # unknown where they are refused themselves
         gaussians = info.data.get("gaussians")
-        if gaussians is None or any(scene.light == "shadowed" for scene in gaussians):
+        if gaussians is None or any(scene.light in (None, "shadowed") for scene in gaussians):
             return lights
         for number, light in enumerate(lights):
             if light.only_shadows:
