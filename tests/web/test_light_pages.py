@@ -193,7 +193,7 @@ return found;
 def test_form_begins_with_the_light_that_a_run_has_learnt() -> None:
     page = "const estimate = () => json({});" + LIGHT_PAGE + STAGES
     found = in_form("_light.html", LEARNT, page)
-    assert found["words"] == "has its materials and their light"
+    assert found["words"] == "in its own light"
     first, lit, shadowed = (parse_stage(found[name], name) for name in ("first", "sky", "shadowed"))
     assert first.gaussians[0].light is None and first.environment is None and first.lights == ()
     assert "# no light: materials, in the light that was learnt with them" in found["first"]
