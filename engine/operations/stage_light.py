@@ -151,9 +151,9 @@ def first_stage_light(
     """
     light = choose_light(source, gaussians)
     if light.reason:
-        told = shown_as_harmonics(light.reason)
-        note(f"{source}: {told}")
-        return StageLight(note=(f"The scene has materials, but {told}",))
+        sentence = shown_as_harmonics(light.reason)
+        note(f"{source}: {sentence}")
+        return StageLight(note=(f"The scene has materials, but {sentence}",))
     if light.learnt is None:
         return StageLight()
     return StageLight(
