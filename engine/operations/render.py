@@ -288,19 +288,22 @@ def _render_on_stage(plan: _RenderPlan, progress: EventListener, threads: int) -
     request, source, cameras, shots, output = plan
     from octasplat.engine.gaussians.materials import has_materials
     from octasplat.engine.operations.render_source import stage_scene
+    from octasplat.engine.operations.stage_light import lit_stage
     from octasplat.engine.pathtracing.stage.stage_file import stage_identity
     from octasplat.engine.pathtracing.stage_motion import is_moving
     from octasplat.engine.pathtracing.stage_rendering import compile_stage
     from octasplat.engine.render.render_digest import render_digest
     from octasplat.engine.render.renderer import background_color
 
-    stage = request.staged
-    assert stage is not None
-    if source.learnt is not None and request.background is None and stage.environment is None:
+    given = request.staged
+    assert given is not None
+    if source.learnt is not None and request.background is None and given.environment is None:
         progress(Warned(STAGE_LACKS_BACKGROUND))
-    shown = {part.light for part in stage.gaussians if part.file is None}
-    if has_materials(source.gaussians) and shown - {"relit"}:
+    named = {part.light for part in given.gaussians if part.file is None}
+    if has_materials(source.gaussians) and named - {"relit", None}:
         progress(Noted(STAGE_LACKS_MATERIALS))
+    lit = lit_stage(given, request.source, source.gaussians, lambda text: progress(Noted(text)))
+    stage = lit.stage
     for sentence in _ignored_light(stage):
         progress(Warned(sentence))
     transparent = request.background == "transparent"
@@ -317,7 +320,7 @@ def _render_on_stage(plan: _RenderPlan, progress: EventListener, threads: int) -
     finished = output.finished_images(
         render_digest(
             source.gaussians, source.settings, background, transparent, cameras,
-            stage_identity(stage, request.stage_folder), views, scene.photographs,
+            stage_identity(given, request.stage_folder), views, scene.photographs, *lit.identity,
             *output.numbered(shots, counts=is_moving(stage) and cameras is None),
         )
     )  # fmt: skip

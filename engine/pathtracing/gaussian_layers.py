@@ -20,6 +20,7 @@ from octasplat.engine.pathtracing.kernels.gaussian_surface import ALBEDO, FEATUR
 from octasplat.engine.pathtracing.kernels.path_args import GaussianBoxes
 from octasplat.engine.pathtracing.mesh_shapes import rotation_matrix
 from octasplat.engine.pathtracing.stage.model import Stage, StageGaussians
+from octasplat.engine.pathtracing.stage.stage_template import FILE_HAS_NO_LIGHT, shown_as_harmonics
 from octasplat.engine.trace.facing_normals import face_viewer
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import Tracer, TraceResult, TraceSettings
@@ -77,6 +78,7 @@ def build_gaussian_layers(
     *,
     size: float,
     threads: int = 0,
+    note: Callable[[str], None] = lambda _sentence: None,
 ) -> GaussianLayers | None:
     """Return the Gaussian scenes of a stage, placed, merged and ready to be traced; None without any.
 
@@ -88,6 +90,7 @@ def build_gaussian_layers(
         settings: where rays are cut off.
         size: of the scene, world units; see :func:`default_shadow_bias`.
         threads: for building and tracing; 0 takes all.
+        note: called with a sentence on each entry whose materials are left out without it being asked for.
 
     Raises:
         ConfigError: an entry without a file, and no scene is rendered.
@@ -100,6 +103,8 @@ def build_gaussian_layers(
         gaussians = main_gaussians if scene.file is None else read_gaussians(folder / scene.file)
         assert gaussians is not None
         placed = place_gaussians(gaussians, scene)
+        if scene.file is not None and scene.light is None and has_materials(gaussians):
+            note(f"gaussians[{number}]: {scene.file}: {shown_as_harmonics(FILE_HAS_NO_LIGHT)}")
         surface = scene.light == "relit" and has_materials(gaussians)
         parts.append(_without_color(placed) if surface else placed)
         features.append(_material_features(placed, scene) if surface else _layer_features(placed, scene))
@@ -171,7 +176,7 @@ def place_gaussians(gaussians: FlatGaussians, placement: StageGaussians) -> Flat
 
 def _layer_features(gaussians: FlatGaussians, scene: StageGaussians) -> Float32[np.ndarray, "n f"]:
     values = np.zeros((len(gaussians), FEATURE_COUNT), np.float32)
-    if scene.light == "shadowed":
+    if scene.light in (None, "shadowed"):
         values[:, SHADOWED], values[:, ADDITIVE] = 1.0 - scene.ambient, 1.0
     elif scene.light == "relit":
         values[:, RELIT], values[:, AMBIENT] = 1.0, scene.ambient

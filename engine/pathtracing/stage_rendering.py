@@ -81,7 +81,8 @@ def compile_stage(
         scene.note(places_note(scene.origin_world) + subtracted)
     layers = build_gaussian_layers(
         stage, scene.gaussians, scene.read_gaussians, scene.folder, scene.settings,
-        size=SIZE_PER_RADIUS * scene.turntable(np.array(stage.up)).radius, threads=scene.threads,
+        size=SIZE_PER_RADIUS * scene.turntable(np.array(stage.up)).radius,
+        threads=scene.threads, note=scene.note,
     )  # fmt: skip
     first = _tracer_of(
         stage_at(stage, 0), scene, layers, shots[:1] if is_moving(stage) else shots, scene.warn

@@ -81,6 +81,7 @@ async def show_job(request: Request, job_id: uuid.UUID, principal: Reader, servi
     )
     held_out = await run_in_pool(ThreadPurpose.DOWNLOADS, read_names, service.storage, by_name.get(HELD_OUT))
     figures = read_measurements(metrics, artifacts, photographs)
+    shows_materials = LIGHT_FILE in by_name and _shows_materials(config)
     preview = detail.line.job.preview or {}
     preview_path = f"images/{preview.get('view')}"
     extra = [
@@ -96,7 +97,7 @@ async def show_job(request: Request, job_id: uuid.UUID, principal: Reader, servi
         principal,
         detail=detail,
         measured=figures,
-        light=stage_form(figures, artifacts, photographs, service.settings)
+        light=stage_form(figures, artifacts, photographs, service.settings, has_learnt_light=shows_materials)
         if principal.may("write")
         else None,
         relight=await relight_form(service, principal, artifacts, held_out),
@@ -119,7 +120,7 @@ async def show_job(request: Request, job_id: uuid.UUID, principal: Reader, servi
         q=_octagon_q(config),
         up=_up_world(config),
         background=_evaluation_background(config),
-        shows_materials=LIGHT_FILE in by_name and _shows_materials(config),
+        shows_materials=shows_materials,
         photograph=preview_path if any(file.path == preview_path for file in photographs) else None,
         further=[options_form(kind, unwritable) for kind in extra] if principal.may("write") else [],
         max_file_bytes=service.settings.max_upload_bytes,
@@ -275,7 +276,7 @@ def _up_world(config: dict[str, object]) -> str:
 
 
 def _shows_materials(config: dict[str, object]) -> bool:
-    """Return whether the 3D view can show the materials of a result, as ``octasplat view`` decides it.
+    """Return whether the 3D view and stages show the materials of a result, as ``octasplat view`` decides it.
 
     Where base colors hold the light of a room, light from far away cannot show them.
     """

@@ -37,11 +37,14 @@ class StageForm:
         views: where things can be placed.
         priority: of a preview.
         max_file_bytes: length of one file that is sent.
+        has_learnt_light: whether the scene has materials and the light that they were learnt in, with which
+            the form begins.
     """
 
     views: list[PlacementView]
     priority: int
     max_file_bytes: int
+    has_learnt_light: bool
 
 
 def stage_form(
@@ -49,8 +52,18 @@ def stage_form(
     artifacts: Sequence[Artifact],
     photographs: Sequence[DatasetFile],
     settings: ServiceSettings,
+    *,
+    has_learnt_light: bool,
 ) -> StageForm | None:
-    """Return the form for a job's result; None where it has no scene or no image to place meshes in."""
+    """Return the form for a job's result; None where it has no scene or no image to place meshes in.
+
+    Args:
+        measured: measures of the held-out views.
+        artifacts: of the job.
+        photographs: that it was made from, with their sizes.
+        settings: limits of the service.
+        has_learnt_light: see :class:`StageForm`.
+    """
     names = {row.name for row in artifacts}
     if measured is None or not names.issuperset(REQUIRED_RESULTS):
         return None
@@ -63,4 +76,4 @@ def stage_form(
     if not views:
         return None
     priority = min(PREVIEW_PRIORITY, settings.max_priority)
-    return StageForm(views[:MAX_VIEWS], priority, settings.max_upload_bytes)
+    return StageForm(views[:MAX_VIEWS], priority, settings.max_upload_bytes, has_learnt_light)

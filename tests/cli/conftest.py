@@ -28,6 +28,8 @@ TINY = (
 """Settings of a run of a second."""
 MESHES = "octagons.ply,octagons.obj,octagons.glb,viewer.glb"
 """What a run exports by itself, without the textured surface, which takes longer than all else."""
+LIT_UP = [0.0, -0.8, 0.6]
+"""Up of the learnt light of ``lit_run``."""
 
 Octasplat = Callable[..., Result]
 
@@ -123,3 +125,18 @@ def shiny_run(run, tmp_path_factory) -> Path:
     content["reconstruction"] = given.model_dump(mode="json")
     (root / "run" / "config.json").write_text(json.dumps(content))
     return root / "run"
+
+
+@pytest.fixture(scope="session")
+def lit_run(shiny_run, tmp_path_factory) -> Path:
+    """A run with materials whose light differs all around, with an up of its own."""
+    run = tmp_path_factory.mktemp("lit") / "run"
+    shutil.copytree(shiny_run, run)
+    light = np.full((16, 32, 3), 0.05, np.float32)
+    light[:, :16, 0], light[:8, :, 1], light[:, 8:24, 2] = 0.6, 0.4, 0.5
+    for name in ("environment.exr", "environment.hdr"):
+        write_environment(run / name, light)
+    config = json.loads((run / "config.json").read_text())
+    config["reconstruction"]["train"]["materials"]["up_world"] = LIT_UP
+    (run / "config.json").write_text(json.dumps(config))
+    return run

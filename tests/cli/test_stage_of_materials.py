@@ -1,37 +1,19 @@
 """``stage init`` of a run with materials: lit by the light that the run has learnt, at every door."""
 
-import json
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import octasplat as osp
 from octasplat.engine.core.psnr import psnr
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from octasplat.engine.pathtracing.stage.stage_file import read_stage
-from octasplat.engine.render.environment_files import write_environment
 from octasplat.engine.render.image_files import read_image
+from tests.cli.conftest import LIT_UP
 from tests.cli.test_render_jobs import results_of
 
 VIEW = ("--max-side", 48, "--photograph", "view_000.png", "--threads", 1)
-UP = [0.0, -0.8, 0.6]
-
-
-@pytest.fixture(scope="module")
-def lit_run(shiny_run, tmp_path_factory) -> Path:
-    """A run with materials whose light differs all around, with an up of its own."""
-    run = tmp_path_factory.mktemp("lit") / "run"
-    shutil.copytree(shiny_run, run)
-    light = np.full((16, 32, 3), 0.05, np.float32)
-    light[:, :16, 0], light[:8, :, 1], light[:, 8:24, 2] = 0.6, 0.4, 0.5
-    for name in ("environment.exr", "environment.hdr"):
-        write_environment(run / name, light)
-    config = json.loads((run / "config.json").read_text())
-    config["reconstruction"]["train"]["materials"]["up_world"] = UP
-    (run / "config.json").write_text(json.dumps(config))
-    return run
 
 
 def without_ball(stage: Path, samples: int = 64) -> None:
@@ -49,7 +31,7 @@ def test_stage_init_of_a_run_with_materials_shows_what_render_does(lit_run, octa
     read = read_stage(stage)
     assert read.gaussians[0].light == "relit" and read.environment is not None and read.lights == ()
     assert (stage.parent / read.environment.file).resolve() == (lit_run / "environment.exr").resolve()
-    assert read.environment.up == tuple(UP) and not read.environment.visible
+    assert read.environment.up == tuple(LIT_UP) and not read.environment.visible
     assert "materials" in stage.read_text() and "learnt" in stage.read_text()
     without_ball(stage)
     turned = tmp_path / "elsewhere" / "turned.toml"
@@ -75,7 +57,7 @@ def test_stage_init_of_a_runs_scene_file_takes_the_light_and_up_of_the_run(lit_r
     done = octasplat("stage", "init", lit_run / "scene.ply", "--up", "x", "-o", tmp_path / "x.toml")
     assert done.exit_code == 0 and "A file does not say" not in done.stderr
     read = read_stage(tmp_path / "x.toml")
-    assert read.up == (1, 0, 0) and read.environment is not None and read.environment.up == tuple(UP)
+    assert read.up == (1, 0, 0) and read.environment is not None and read.environment.up == tuple(LIT_UP)
 
 
 def test_stage_init_puts_the_light_beside_the_stage_when_asked(lit_run, octasplat, tmp_path):
@@ -96,7 +78,7 @@ def test_stage_init_job_puts_the_light_beside_the_stage(lit_run, tmp_path):
     assert {path.name for path in results.iterdir()} == {"stage.toml", "environment.exr"}
     read = read_stage(results / "stage.toml")
     assert read.gaussians[0].light == "relit" and read.environment is not None
-    assert read.environment.file == "environment.exr" and read.environment.up == tuple(UP)
+    assert read.environment.file == "environment.exr" and read.environment.up == tuple(LIT_UP)
     assert (results / "environment.exr").read_bytes() == (lit_run / "environment.exr").read_bytes()
 
 
@@ -106,28 +88,31 @@ def test_stage_init_in_python_takes_the_light_of_the_run(lit_run, tmp_path):
     assert read.gaussians[0].light == "relit" and read.environment is not None
 
 
-@pytest.mark.parametrize("case", ["file", "some", "near_field", "no_map"])
-def test_stage_init_says_why_materials_are_not_shown(lit_run, octasplat, tmp_path, case):
-    run = tmp_path / "run"
+def spoil_run(lit_run: Path, folder: Path, case: str) -> tuple[Path, str]:
+    """A copy of the run whose materials no stage can light by itself, and words on why."""
+    run = folder / "run"
     shutil.copytree(lit_run, run)
-    source, words = run, ""
     if case == "file":
-        source, words = tmp_path / "alone.ply", "a file does not hold the light"
-        shutil.copy(run / "scene.ply", source)
-    elif case == "some":
-        words = "some of its Gaussians came from a scene without"
+        shutil.copy(run / "scene.ply", folder / "alone.ply")
+        return folder / "alone.ply", "a file does not hold the light"
+    if case == "some":
         gaussians, _ = read_gaussian_ply(run / "scene.ply")
         for values in gaussians.channels.values():
             values[0] = 0
         write_gaussian_ply(gaussians, run / "scene.ply")
-    elif case == "near_field":
-        words = "base colors hold the light of the photographs"
+        return run, "some of its Gaussians came from a scene without"
+    if case == "near_field":
         text = (run / "config.json").read_text().replace('"recipe": "split_sum"', '"recipe": "near_field"')
         (run / "config.json").write_text(text)
-    else:
-        words = "the run holds no light"
-        for path in run.glob("environment.*"):
-            path.unlink()
+        return run, "base colors hold the light of the photographs"
+    for path in run.glob("environment.*"):
+        path.unlink()
+    return run, "the run holds no light"
+
+
+@pytest.mark.parametrize("case", ["file", "some", "near_field", "no_map"])
+def test_stage_init_says_why_materials_are_not_shown(lit_run, octasplat, tmp_path, case):
+    source, words = spoil_run(lit_run, tmp_path, case)
     done = octasplat("stage", "init", source, "-o", tmp_path / "stage.toml")
     if case == "no_map" and done.exit_code:
         assert "environment" in done.stderr and "Traceback" not in done.stderr

@@ -59,7 +59,7 @@ def test_stage_file_with_all_keys_is_read(tmp_path: Path) -> None:
         """
     )
     stage = read_stage(tmp_path / "stage.toml")
-    assert [scene.light for scene in stage.gaussians] == ["relit", "shadowed"]
+    assert [scene.light for scene in stage.gaussians] == ["relit", None]
     assert isinstance(stage.meshes[0].material, MetallicRoughness)
     assert stage.meshes[1].material == Glass(ior=1.33, absorption=(1, 0, 0))
     assert isinstance(stage.lights[0], PointLight) and stage.integrator.samples == 4
@@ -100,6 +100,18 @@ def test_stage_file_with_all_keys_is_read(tmp_path: Path) -> None:
         ("up = [0, 0, 0]", "up has no length"),
         ("[integrator]\naperture = 0.1", "needs a focus_distance"),
         ("[integrator]\nsamples = 0", r"integrator\.samples"),
+        ("[integrator]\nsamples = true", r"samples: must be a whole number from 1 to 65536 \(it is true\)"),
+        (BALL + "scale = true", r"scale: must be one positive number, or three .* \(it is true\)"),
+        (BALL + "scale = [1, 1, true]", r"scale: must be .* \(it is \[1, 1, true\]\)"),
+        (
+            '[[lights]]\nkind = "point"\nposition = [0, 0, 0]\nintensity = true',
+            r"intensity: must be a number of 0 or more \(it is true\)",
+        ),
+        (
+            BALL + 'material = { kind = "glass", ior = true }',
+            r"ior: must be a number from 1 to 4",
+        ),
+        ("version = true", r"version: must be 1 \(it is true\)"),
         ("[[gaussians]]\nscale = [1, 2, 3]", "one scale"),
         ("[[lights]]\nposition = [0, 0, 0]", r"lights\[0\]: has no `kind`"),
         ('[[lights]]\nkind = "lamp"', "no kind 'lamp'; choose one of 'point', 'spot'"),
@@ -265,7 +277,10 @@ def test_reading_stages_needs_neither_torch_nor_numba() -> None:
 
 
 def test_stage_default_scene_mode() -> None:
-    assert Stage().gaussians[0].light == "shadowed"
+    assert Stage().gaussians[0].light is None
+    # services and workers of former versions take no null
+    assert "light" not in Stage().model_dump(mode="json")["gaussians"][0]
+    assert StageGaussians(light="shadowed").model_dump(mode="json")["light"] == "shadowed"
 
 
 def test_example_stages_are_valid(tmp_path: Path) -> None:

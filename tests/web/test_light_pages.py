@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import octasplat.service.web as service_web
+from octasplat.engine.pathtracing.stage.stage_file import parse_stage
 from octasplat.engine.render.environment_files import write_environment
 from octasplat.service.web.templating import render_template
 from tests.support.browser import open_page
@@ -20,7 +21,8 @@ JOB = SimpleNamespace(id=uuid.UUID(int=1), queue="cpu")
 LIMITS = {"priority": 1, "max_file_bytes": 1 << 30}
 MAP = SimpleNamespace(dataset_id=uuid.UUID(int=2), name="sky.hdr", title="")
 VIEWS = [SimpleNamespace(name="a.jpg", render="renders/a.png", width=400, height=300)]
-LIGHT = {"light": SimpleNamespace(views=VIEWS, **LIMITS)}
+LIGHT = {"light": SimpleNamespace(views=VIEWS, has_learnt_light=False, **LIMITS)}
+LEARNT = {"light": SimpleNamespace(views=VIEWS, has_learnt_light=True, **LIMITS)}
 RELIGHT = {"relight": SimpleNamespace(views=["a.jpg"], maps=[MAP], learnt="layers/environment.png", **LIMITS)}
 SCRIPT = """<script type="module">
 const pause = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
@@ -171,3 +173,35 @@ def test_what_is_wrong_with_a_stage_is_told_by_itself() -> None:
         "With 100,000 Gaussians the held-out views would take at most 5 s, a turntable of 96 frames 2 min; "
         "fewer are faster.",
     ]
+
+
+STAGES = """
+const text = () => document.querySelector(".stage-text").textContent;
+const choose = (id, value) => { find(id).value = value; fire(find(id), "input"); };
+const found = { words: find("light-scene").selectedOptions[0].textContent, first: text() };
+const sky = new DataTransfer();
+sky.items.add(new File(["x"], "sky.hdr"));
+document.querySelector("[name=sky]").files = sky.files;
+choose("light-light", "sun");
+found.sky = text();
+choose("light-scene", "shadowed");
+found.shadowed = text();
+return found;
+"""
+
+
+def test_form_begins_with_the_light_that_a_run_has_learnt() -> None:
+    page = "const estimate = () => json({});" + LIGHT_PAGE + STAGES
+    found = in_form("_light.html", LEARNT, page)
+    assert found["words"] == "in its own light"
+    first, lit, shadowed = (parse_stage(found[name], name) for name in ("first", "sky", "shadowed"))
+    assert first.gaussians[0].light is None and first.environment is None and first.lights == ()
+    assert "# no light: materials, in the light that was learnt with them" in found["first"]
+    assert lit.gaussians[0].light is None and lit.environment is not None and len(lit.lights) == 1
+    assert "# no light: materials, in the light below" in found["sky"]
+    assert shadowed.gaussians[0].light == "shadowed"
+    # of a scene without materials it begins as ever
+    found = in_form("_light.html", LIGHT, page)
+    first = parse_stage(found["first"], "first")
+    assert found["words"] == "takes shadows" and first.gaussians[0].light == "shadowed"
+    assert len(first.lights) == 1

@@ -65,11 +65,24 @@ def job(service: RunningService, folder: Path) -> str:
     return done.stdout.strip().splitlines()[-1]
 
 
+def page_of(service: RunningService, job: str) -> str:
+    """The page of a job, as text."""
+    page = urllib.request.Request(f"{service.url}/jobs/{job}", headers=BEARER)
+    with urllib.request.urlopen(page, timeout=60) as answer:
+        text: str = answer.read().decode()
+    return text
+
+
 @pytest.mark.exhaustive
 def test_materials_page_offers_layers_relight_and_edit(
     service: RunningService, browse: Browse, folder: Path, job: str
 ) -> None:
     service.worker.run(uuid.UUID(job), folder / "run")
+    # the form of a stage begins with the light that was learnt
+    assert (
+        '<select id="light-scene" name="scene" aria-describedby="light-scene-help"><option value="learnt">'
+        in (page_of(service, job))
+    )
     found = browse("relight", service.url, job=job, map=str(folder / "a map.hdr"), by="path")
 
     worst, other = found["render"][0].removeprefix("renders/"), found["other"][0].rpartition("/")[2]
@@ -114,9 +127,8 @@ def test_result_without_materials_has_no_materials_page(
     left_out = shutil.ignore_patterns("environment.hdr", "layers")
     shutil.copytree(folder / "run", tmp_path / "run", ignore=left_out)
     service.worker.run(uuid.UUID(plain), tmp_path / "run")
-    page = urllib.request.Request(f"{service.url}/jobs/{plain}", headers=BEARER)
-    with urllib.request.urlopen(page, timeout=60) as answer:
-        text = answer.read().decode()
+    text = page_of(service, plain)
     assert "Held-out views" in text
+    assert '<select id="light-scene" name="scene"><option value="shadowed">' in text
     for part in ('id="relight"', 'data-kind="material"', "Base color, times"):
         assert part not in text

@@ -4,11 +4,22 @@ import re
 from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic_core import PydanticKnownError
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-UnitInterval = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+
+def _refuse_truth(value: object) -> object:
+    """Return any value but true and false: Python, and so pydantic, takes these as 1 and 0."""
+    if isinstance(value, bool):
+        raise PydanticKnownError("float_type")
+    return value
+
+
+IS_NUMBER = BeforeValidator(_refuse_truth)
+"""Behind the bounds of a number, which the schema would lack otherwise."""
+Finite = Annotated[float, Field(allow_inf_nan=False), IS_NUMBER]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False), IS_NUMBER]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False), IS_NUMBER]
+UnitInterval = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False), IS_NUMBER]
 Vector = tuple[Finite, Finite, Finite]
 Rgb = tuple[UnitInterval, UnitInterval, UnitInterval]
 

@@ -4,7 +4,14 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from octasplat.engine.pathtracing.stage.base import WHITE, Color, NonNegative, StageModel, UnitInterval
+from octasplat.engine.pathtracing.stage.base import (
+    IS_NUMBER,
+    WHITE,
+    Color,
+    NonNegative,
+    StageModel,
+    UnitInterval,
+)
 
 
 class NormalMapped(StageModel):
@@ -99,12 +106,12 @@ class Glass(StageModel):
     """
 
     kind: Literal["glass"] = "glass"
-    ior: Annotated[float, Field(ge=1, le=4)] = 1.5
+    ior: Annotated[float, Field(ge=1, le=4), IS_NUMBER] = 1.5
     tint_srgb: Color = WHITE
     absorption: tuple[NonNegative, NonNegative, NonNegative] = (0.0, 0.0, 0.0)
     roughness: UnitInterval = 0.0
     multiple_scattering: bool = True
-    priority: Annotated[int, Field(ge=0, le=1000)] | None = None
+    priority: Annotated[int, Field(ge=0, le=1000), IS_NUMBER] | None = None
 
 
 class Metal(NormalMapped, ClearCoated):
@@ -136,7 +143,7 @@ class Dielectric(NormalMapped, Emissive, Cutout, ClearCoated):
     color_srgb: Color = (0.8, 0.8, 0.8)
     texture: str | None = None
     roughness: UnitInterval = 0.3
-    ior: Annotated[float, Field(gt=1, le=4)] = 1.5
+    ior: Annotated[float, Field(gt=1, le=4), IS_NUMBER] = 1.5
 
 
 class MetallicRoughness(NormalMapped, Emissive, Cutout, ClearCoated):
@@ -161,7 +168,7 @@ class MetallicRoughness(NormalMapped, Emissive, Cutout, ClearCoated):
     metallic: UnitInterval = 0.0
     roughness: UnitInterval = 1.0
     metallic_roughness_texture: str | None = None
-    ior: Annotated[float, Field(gt=1, le=4)] = 1.5
+    ior: Annotated[float, Field(gt=1, le=4), IS_NUMBER] = 1.5
     diffuse: Literal["coupled", "burley"] = "coupled"
     multiple_scattering: bool = True
 

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from octasplat.engine.pathtracing.stage.base import (
+    IS_NUMBER,
     WHITE,
     Color,
     Finite,
@@ -80,7 +81,7 @@ class StageMesh(Transformed):
     shape: Literal["sphere", "cube", "plane"] | None = None
     up_axis: Literal["world", "x", "-x", "y", "-y", "z", "-z"] | None = None
     turn_degrees: Finite = 0.0
-    smooth_degrees: Annotated[float, Field(ge=0, le=180)] | None = None
+    smooth_degrees: Annotated[float, Field(ge=0, le=180), IS_NUMBER] | None = None
     material: Material | None = None
     on: RestingPlace | None = None
     keys: Keys[MeshKey] = ()
@@ -155,8 +156,8 @@ class SpotLight(LightModel):
     position: Vector
     direction: Vector
     intensity: NonNegative
-    outer_degrees: Annotated[float, Field(gt=0, lt=90)] = 30.0
-    inner_degrees: Annotated[float, Field(ge=0, lt=90)] = 20.0
+    outer_degrees: Annotated[float, Field(gt=0, lt=90), IS_NUMBER] = 30.0
+    inner_degrees: Annotated[float, Field(ge=0, lt=90), IS_NUMBER] = 20.0
 
     @model_validator(mode="after")
     def _check_cone(self) -> "SpotLight":
@@ -249,7 +250,9 @@ class StageGaussians(Transformed):
         light: ``emissive`` shows the trained colors as they are; ``shadowed`` takes from them what the
             meshes keep off of the stage's lights, and adds the light of those that add theirs, and of meshes
             that shine; ``relit`` takes them as the albedo of a matt surface with
-            the octagons' normals that the stage's lights shine on.
+            the octagons' normals that the stage's lights shine on, or shows the materials of a scene that has
+            some. None is ``relit`` for the scene of a run whose materials can be lit, by the stage's
+            environment or by the light that the run has learnt, and else ``shadowed``.
         ambient: share of the trained color that is there without the stage's lights (shadowed, relit).
         shadows_on_meshes: whether they keep light off the meshes.
         shadows_on_gaussians: whether they keep light off the Gaussians. Trained colors hold the scene's
@@ -259,7 +262,10 @@ class StageGaussians(Transformed):
     """
 
     file: str | None = None
-    light: Literal["emissive", "shadowed", "relit"] = "shadowed"
+    # not written where it is not given: former versions, of services and of workers, take no null
+    light: Literal["emissive", "shadowed", "relit"] | None = Field(
+        None, exclude_if=lambda light: light is None
+    )
     ambient: UnitInterval = 0.4
     shadows_on_meshes: bool = True
     shadows_on_gaussians: bool = False
@@ -292,13 +298,13 @@ class Integrator(StageModel):
             colors stay as they are. Needs the extra ``denoise``.
     """
 
-    samples: Annotated[int, Field(ge=1, le=65536)] = 16
-    max_depth: Annotated[int, Field(ge=1, le=64)] = 8
-    roulette_depth: Annotated[int, Field(ge=1, le=64)] = 4
-    seed: Annotated[int, Field(ge=0, lt=1 << 31)] = 0
+    samples: Annotated[int, Field(ge=1, le=65536), IS_NUMBER] = 16
+    max_depth: Annotated[int, Field(ge=1, le=64), IS_NUMBER] = 8
+    roulette_depth: Annotated[int, Field(ge=1, le=64), IS_NUMBER] = 4
+    seed: Annotated[int, Field(ge=0, lt=1 << 31), IS_NUMBER] = 0
     anti_aliasing: bool = True
     clamp: Positive | None = None
-    exposure: Annotated[float, Field(ge=-20, le=20)] = 0.0
+    exposure: Annotated[float, Field(ge=-20, le=20), IS_NUMBER] = 0.0
     tone: Literal["none", "reinhard", "filmic"] = "none"
     aperture: NonNegative = 0.0
     focus_distance: Positive | None = None
@@ -325,7 +331,7 @@ class Stage(StageModel):
         integrator: how the picture is computed.
     """
 
-    version: Literal[1] = 1
+    version: Annotated[Literal[1], IS_NUMBER] = 1
     up: Vector = (0.0, -1.0, 0.0)
     gaussians: Annotated[tuple[StageGaussians, ...], Field(max_length=MAX_SCENES)] = (StageGaussians(),)
     meshes: Annotated[tuple[StageMesh, ...], Field(max_length=MAX_MESHES)] = ()
@@ -338,7 +344,7 @@ class Stage(StageModel):
     def _check_shadows_fall(cls, lights: tuple[Light, ...], info: Any) -> tuple[Light, ...]:
         # unknown where they are refused themselves
         gaussians = info.data.get("gaussians")
-        if gaussians is None or any(scene.light == "shadowed" for scene in gaussians):
+        if gaussians is None or any(scene.light in (None, "shadowed") for scene in gaussians):
             return lights
         for number, light in enumerate(lights):
             if light.only_shadows:

@@ -7,7 +7,7 @@ from typing import Annotated, TypeVar
 
 from pydantic import Field, model_validator
 
-from octasplat.engine.pathtracing.stage.base import Finite, StageModel, Vector
+from octasplat.engine.pathtracing.stage.base import IS_NUMBER, Finite, StageModel, Vector
 
 MAX_KEYS = 1000
 _LEAST_SUM = 1e-3
@@ -22,7 +22,7 @@ class MotionKey(StageModel):
         position: as that of the thing or lamp.
     """
 
-    frame: Annotated[int, Field(ge=0)]
+    frame: Annotated[int, Field(ge=0), IS_NUMBER]
     position: Vector | None = None
 
     @model_validator(mode="after")

@@ -10,6 +10,17 @@ from octasplat.engine.core.writing import write_text
 
 BALL_RADIUS_FRACTION = 0.12
 """Radius of the first stage's ball."""
+FILE_HAS_NO_LIGHT = "a file does not hold the light that its materials were learnt in."
+_HOW = 'For materials write light = "relit" under [[gaussians]] and name a map of light under [environment].'
+
+
+def shown_as_harmonics(reason: str) -> str:
+    """Return that a scene with materials is shown without them, why, and how to show them.
+
+    Args:
+        reason: a sentence.
+    """
+    return f"{reason} So the stage shows its harmonics. {_HOW}"
 
 
 @dataclass(frozen=True)

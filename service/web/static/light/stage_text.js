@@ -15,7 +15,8 @@ export function stageText(values, scene, spot, extent) {
     const on = `on = { view = ${quoted(spot.view)}, pixel = [${number(spot.x)}, ${number(spot.y)}] }`;
     const up = unit(scene.up);
     const lifted = values.floor ? `position = ${vector(scaled(up, LIFT * size))}` : null;
-    const parts = [["version = 1", `up = ${vector(up)}`], ["[[gaussians]]", `light = ${quoted(values.scene)}`]];
+    const mode = values.scene === "learnt" ? `# no light: materials, in the light ${values.sky ? "below" : "that was learnt with them"}` : `light = ${quoted(values.scene)}`;
+    const parts = [["version = 1", `up = ${vector(up)}`], ["[[gaussians]]", mode]];
     if (values.thing !== "none" && (values.thing !== "file" || values.mesh)) {
         const height = values.size / 100 * size;
         parts.push([
