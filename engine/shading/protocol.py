@@ -91,7 +91,7 @@ class ShadedRays:
 
 
 def concatenate_shaded(parts: Iterable[ShadedRays]) -> ShadedRays:
-    """Return shaded rays one after the other, without anything for a backward pass; all have the same layers."""
+    """Return shaded rays one after the other, for no backward pass; all parts have the same layers."""
     kept = list(parts)
     return ShadedRays(
         np.concatenate([part.rgb_srgb for part in kept]),

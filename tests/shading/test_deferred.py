@@ -250,7 +250,7 @@ def test_many_rays_that_are_only_measured_are_shaded_some_at_a_time(monkeypatch:
     )
     model = DeferredShading(MaterialSettings(**BARE, up_world=(0, 0, 1)), extent_world=1.0)
     model.light.set_radiance(np.random.default_rng(0).random((16, 32, 3), np.float32))
-    ways = np.random.default_rng(1).normal(0, 0.2, (1000, 3)) + [0.0, 0.6, -0.8]
+    ways = np.random.default_rng(1).normal((0.0, 0.6, -0.8), 0.2, (1000, 3))
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
     rays, tracer = RayBatch(np.array([[0, 0, 0.5]]), ways), LargestTraceTracer(threads=1)
     tracer.build(mirrors, model.features(mirrors))
