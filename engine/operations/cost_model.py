@@ -93,7 +93,7 @@ _MATERIAL_START_BYTES, _MATERIAL_TRAIN_BYTES = 1_370 << 20, 500 << 20
 _RAY_BYTES = 21_000
 _PIXEL_BYTES = 290
 """For a pixel of the largest photograph, when a view is measured; what training needed is free by then."""
-_MATERIAL_PIXEL_BYTES = 550
+_MATERIAL_PIXEL_BYTES = 600
 """The same with materials, whose pictures have more layers, and several rays a pixel."""
 _CACHED_PIXEL_BYTES = 3
 _IMAGE_PIXEL_BYTES = {"exr": 7.0, "png": 0.4, "mp4": 0.4}
