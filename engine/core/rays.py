@@ -8,6 +8,8 @@ from jaxtyping import Float, Float32, Float64, Int
 
 AT_INFINITY = -np.inf
 """Viewer of rays whose colors are those in their own direction."""
+SHIFTED_PIXELS_AT_ONCE = 1 << 16
+"""Rays of so many pixels are offset at a time, as that is worked out in float64."""
 
 
 @dataclass(frozen=True, init=False, eq=False)
@@ -191,12 +193,16 @@ class ImageRays:
         """Return the rays offset from the pixel centres, by finite differences of their neighbours."""
         if across_px == 0 and down_px == 0:
             return self
-        ways = self.directions_world.astype(np.float64)
-        for axis, offset in ((1, across_px), (0, down_px)):
-            if ways.shape[axis] > 1:
-                ways = ways + offset * np.gradient(self.directions_world.astype(np.float64), axis=axis)
-        ways /= np.linalg.norm(ways, axis=2, keepdims=True)
-        return ImageRays.from_directions(self.origin_world, ways, float(self.rays.t_min[0]), self.axis_world)
+        given, shifted = self.directions_world, np.empty((self.height_px, self.width_px, 3), np.float32)
+        rows = max(1, SHIFTED_PIXELS_AT_ONCE // max(self.width_px, 1))
+        for top in range(0, self.height_px, rows):
+            # with a row above and below, from which the differences are taken
+            first, last = max(top - 1, 0), min(top + rows + 1, self.height_px)
+            ways = _shifted_ways(given[first:last].astype(np.float64), across_px, down_px)
+            shifted[top : top + rows] = ways[top - first : top - first + rows]
+        return ImageRays.from_directions(
+            self.origin_world, shifted, float(self.rays.t_min[0]), self.axis_world
+        )
 
     @property
     def origin_world(self) -> Float32[np.ndarray, "3"]:
@@ -207,6 +213,16 @@ class ImageRays:
     def directions_world(self) -> Float32[np.ndarray, "h w 3"]:
         """Return the direction of each pixel."""
         return self.rays.directions_world.reshape(self.height_px, self.width_px, 3)
+
+
+def _shifted_ways(
+    given: Float64[np.ndarray, "h w 3"], across_px: float, down_px: float
+) -> Float64[np.ndarray, "h w 3"]:
+    ways = given
+    for axis, offset in ((1, across_px), (0, down_px)):
+        if given.shape[axis] > 1:
+            ways = ways + offset * np.gradient(given, axis=axis)
+    return np.asarray(ways / np.linalg.norm(ways, axis=2, keepdims=True))
 
 
 def _for_kernels(values: Float[np.ndarray, "..."]) -> Float32[np.ndarray, "..."]:

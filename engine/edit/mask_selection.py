@@ -11,7 +11,7 @@ from octasplat.engine.core.rays import ImageRays, RayBatch
 from octasplat.engine.dataset.model import Viewpoints
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.render.image_files import read_image
-from octasplat.engine.render.renderer import tile_order
+from octasplat.engine.render.renderer import RECORDED_RAYS_PER_BATCH, tile_order
 from octasplat.engine.render.shots import view_shots
 from octasplat.engine.runs.config import read_config
 from octasplat.engine.runs.run_folder import CONFIG, is_full_run, run_min_view_distance, run_viewpoints
@@ -70,12 +70,13 @@ def mostly_inside(
 def _blend_weights(tracer: Tracer, rays: RayBatch, count: int) -> Float64[np.ndarray, " n"]:
     """Return the summed blending weight of each Gaussian over rays."""
     sums = np.zeros(count)
-    if len(rays):
-        traced = tracer.trace(rays, record=True)
+    for start in range(0, len(rays), RECORDED_RAYS_PER_BATCH):
+        traced = tracer.trace(rays[start : start + RECORDED_RAYS_PER_BATCH], record=True)
         assert traced.recording is not None
         # Without gradients: only the sums of the blending weights are wanted.
         found = tracer.backward(traced.recording, TraceGradients(np.zeros_like(traced.rgb_srgb))).numpy()
-        sums[found.ids] = found.weight_sums
+        sums[found.ids] += found.weight_sums
+        del traced, found  # the recording's memory serves the next one
     return sums
 
 

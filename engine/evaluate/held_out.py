@@ -1,6 +1,6 @@
 """Renders the held-out views, measures them, and writes their pictures, ``metrics.json`` and the report."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -47,7 +47,9 @@ from octasplat.engine.train.shading_factory import find_background, find_exposur
 MAX_COVERAGE_VIEWS = 24
 """Held-out views whose coverage is measured."""
 MAX_VIEWS_AT_ONCE = 4
-"""Views that are measured and written side by side; each holds several pictures in memory."""
+MAX_PIXELS_AT_ONCE = 1 << 22
+"""Most views that are measured and written side by side, and most pixels of these together where that are
+several: each pixel takes some 130 bytes."""
 RENDERS, LAYERS, METRICS, REPORT = "renders", "layers", "metrics.json", "report.html"
 
 
@@ -103,6 +105,13 @@ def evaluate_held_out(
     for view, measured, known in _finish_views(
         _render_views(dataset, tracer, shading, background, measures),
         lambda view: _write_images(view, output, names[view.name]),
+        views_at_once(
+            (
+                dataset.views[index].width_px * dataset.views[index].height_px
+                for index in dataset.test_indices
+            ),
+            threads or threads_in_use(),
+        ),
         threads or threads_in_use(),
     ):
         rows.append(measured.metrics)
@@ -226,6 +235,16 @@ def _views_to_ask(dataset: Dataset) -> set[int]:
     return set(dataset.test_indices[places].tolist())
 
 
+def views_at_once(pixels: Iterable[int], threads: int) -> int:
+    """Return how many views of so many pixels each are measured and written side by side.
+
+    >>> views_at_once([800 * 533], 8), views_at_once([1600 * 1200], 8), views_at_once([4000 * 3000], 8)
+    (4, 2, 1)
+    """
+    largest = max(pixels, default=1)
+    return min(threads, MAX_VIEWS_AT_ONCE, max(1, MAX_PIXELS_AT_ONCE // largest))
+
+
 class _FinishedView(NamedTuple):
     view: RenderedView
     measured: MeasuredView
@@ -233,14 +252,13 @@ class _FinishedView(NamedTuple):
 
 
 def _finish_views(
-    views: Iterator[RenderedView], write: Callable[[RenderedView], None], threads: int
+    views: Iterator[RenderedView], write: Callable[[RenderedView], None], workers: int, threads: int
 ) -> Iterator[_FinishedView]:
-    """Measure and write a few views side by side, in order.
+    """Measure and write so many views as there are workers side by side, in order.
 
-    Kernels, numpy and the writing of files release the interpreter's lock. Threads beyond
-    ``MAX_VIEWS_AT_ONCE`` share the kernels.
+    Kernels, numpy and the writing of files release the interpreter's lock. Threads beyond the workers share
+    the kernels.
     """
-    workers = min(threads, MAX_VIEWS_AT_ONCE)
 
     def finish(view: RenderedView) -> _FinishedView:
         measured = measure_view(view, threads // workers)

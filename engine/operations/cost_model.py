@@ -11,6 +11,7 @@ from pydantic import BaseModel, computed_field
 
 from octasplat.engine.core.durations import format_duration
 from octasplat.engine.dataset.image_sizes import ImageSizes
+from octasplat.engine.operations.picture_memory import picture_bytes
 from octasplat.engine.operations.relight import RelightOptions
 from octasplat.engine.operations.render import RenderOptions
 from octasplat.engine.operations.render_options import PictureOptions
@@ -92,6 +93,8 @@ _MATERIAL_START_BYTES, _MATERIAL_TRAIN_BYTES = 1_370 << 20, 500 << 20
 _RAY_BYTES = 21_000
 _PIXEL_BYTES = 290
 """For a pixel of the largest photograph, when a view is measured; what training needed is free by then."""
+_MATERIAL_PIXEL_BYTES = 600
+"""The same with materials, whose pictures have more layers, and several rays a pixel."""
 _CACHED_PIXEL_BYTES = 3
 _IMAGE_PIXEL_BYTES = {"exr": 7.0, "png": 0.4, "mp4": 0.4}
 _MAX_IMAGE_PIXEL_BYTES = {"exr": 30.0, "png": 1.2, "mp4": 1.2}
@@ -201,7 +204,8 @@ def estimate_reconstruction(
         training = max(training + _MATERIAL_TRAIN_BYTES, _MATERIAL_START_BYTES)
         if residual_cpu_seconds:
             training += KEPT_BATCHES * train.rays_per_batch * _SHADED_RAY_BYTES
-    memory = _START_BYTES + model_bytes(count) + max(training, _PIXEL_BYTES * largest)
+    each_pixel_bytes = _MATERIAL_PIXEL_BYTES if materials else _PIXEL_BYTES
+    memory = _START_BYTES + model_bytes(count) + max(training, each_pixel_bytes * largest)
     if finds_poses:  # before the training, by a process of its own
         memory = max(memory, _START_BYTES + _MAPPED_BYTES_PER_PHOTOGRAPH * count)
     disk = reconstruction_bytes(options, photographs)
@@ -297,7 +301,7 @@ def estimate_render(options: RenderOptions, photographs: Sequence[ImageSizes], c
     if options.stage is not None:
         each += _PATH_CPU_SECONDS * options.stage.integrator.samples
     cpu_seconds = _RENDER_START_CPU_SECONDS + each * pixels
-    memory = _START_BYTES + _gaussian_bytes(2) * _TYPICAL_RENDER_GAUSSIANS
+    memory = _render_bytes(options, photographs)
     disk = image_bytes(options, photographs)
     most = _max_image_bytes(disk, options.format)
     return _make_estimate(cpu_seconds, memory, cores, disk_bytes=disk, max_disk_bytes=most)
@@ -307,10 +311,18 @@ def estimate_relight(options: RelightOptions, photographs: Sequence[ImageSizes],
     """Return the estimate of relighting; a ray of the split sum counts as a path."""
     each = _PATH_CPU_SECONDS * options.samples_per_pixel * len(options.environments)
     cpu_seconds = _RENDER_START_CPU_SECONDS + each * rendered_pixels(options, photographs)
-    memory = _START_BYTES + _gaussian_bytes(2) * _TYPICAL_RENDER_GAUSSIANS
+    memory = _render_bytes(options, photographs)
     disk = image_bytes(options, photographs, len(options.environments))
     most = _max_image_bytes(disk, options.format)
     return _make_estimate(cpu_seconds, memory, cores, disk_bytes=disk, max_disk_bytes=most)
+
+
+def _render_bytes(options: PictureOptions, photographs: Sequence[ImageSizes]) -> int:
+    """Return the memory of a render: a scene of the usual size, and the largest picture."""
+    shrunk = [capped_sizes(sizes, options.max_side) for sizes in photographs]
+    largest = max((sizes.width_px * sizes.height_px for sizes in shrunk), default=0)
+    scene = _START_BYTES + _gaussian_bytes(2) * _TYPICAL_RENDER_GAUSSIANS
+    return scene + picture_bytes(options, largest)
 
 
 def rendered_pixels(options: PictureOptions, photographs: Sequence[ImageSizes]) -> int:

@@ -34,6 +34,8 @@ DenoiseFn = Callable[
 _NO_SUMS = allocate_film(0)
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 _DARK = 1e-6
+PIXELS_AT_ONCE = 1 << 16
+"""An image is made of so many pixels at a time: what is worked out on the way takes 300 bytes for each."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +112,34 @@ class Film:
             transparent: the background is black and stands for nothing: display values are those of what
                 covers it, not multiplied by alpha, and linear values are multiplied by alpha.
         """
+        height, width = self._shape
+        rows_at_once = max(1, PIXELS_AT_ONCE // max(width, 1))
+        whole = StageImage(
+            np.empty((height, width, 3), np.float32),
+            np.empty((height, width, 3), np.float32),
+            np.empty((height, width), np.float32),
+            {},
+        )
+        for top in range(0, height, rows_at_once):
+            rows = slice(top, min(top + rows_at_once, height))
+            part = self._rows(rows)._image_together(exposure, tone, transparent)
+            whole.rgb_srgb[rows], whole.rgb_linear[rows] = part.rgb_srgb, part.rgb_linear
+            whole.alpha[rows] = part.alpha
+            for name, values in part.layers.items():
+                whole.layers.setdefault(name, np.empty((height, width), np.float32))[rows] = values
+        return whole
+
+    def _rows(self, rows: slice) -> "Film":
+        """Return a film of some rows, which shares their sums with this one."""
+        film, width = copy.copy(self), self._shape[1]
+        film._shape = (rows.stop - rows.start, width)
+        pixels = slice(rows.start * width, rows.stop * width)
+        film._sums = FilmArrays(*(sums[pixels] for sums in self._sums))
+        film.plate = None if self.plate is None else self.plate._rows(rows)
+        film._without_meshes = None if self._without_meshes is None else self._without_meshes._rows(rows)
+        return film
+
+    def _image_together(self, exposure: float, tone: ToneCurve, transparent: bool) -> StageImage:
         linear, alpha = self._linear_radiance(), self._alpha()
         layers = self._mesh_layers(linear)
         if transparent:

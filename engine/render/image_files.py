@@ -127,7 +127,7 @@ def write_exr(path: Path, channels: Mapping[str, Float32[np.ndarray, "h w"]], *,
         OutputError: The file cannot be written.
     """
     names = tuple(channels)
-    stacked = np.stack([channels[name] for name in names], axis=-1).astype(np.float32)
+    stacked = np.stack([channels[name] for name in names], axis=-1).astype(np.float32, copy=False)
     height, width, count = stacked.shape
     spec = oiio.ImageSpec(width, height, count, oiio.FLOAT)
     spec.channelnames = names

@@ -45,12 +45,15 @@ from octasplat.engine.shading.protocol import (
     ShadingGradients,
     ShadingStep,
     TracedRays,
+    concatenate_shaded,
 )
 from octasplat.engine.shading.reflection_tracing import ReflectionTracer
 from octasplat.engine.shading.shading_context import ShadingContext
 from octasplat.engine.shading.split_sum import SurfacePoints, shade, shade_backward
 from octasplat.engine.trace.protocol import TraceGradients, Tracer, TraceResult
 
+MEASURED_RAYS_AT_ONCE = 1 << 14
+"""Whole packets of rays."""
 AMBIENT_COLUMN = 5
 INTERREFLECTION_COLUMNS = slice(6, 9)
 
@@ -204,7 +207,18 @@ class DeferredShading:
         return radiance
 
     def shade(self, traced: TracedRays) -> ShadedRays:
-        """Return display colors, shaded as far as the ramp from the harmonics to that has come."""
+        """Return display colors, shaded as far as the ramp from the harmonics to that has come.
+
+        Of many rays from which nothing is learnt some are shaded at a time: each takes some 20 KB with those
+        that it sends on.
+        """
+        if traced.is_recorded or len(traced.rays) <= MEASURED_RAYS_AT_ONCE:
+            return self._shade_together(traced)
+        return concatenate_shaded(
+            replace(self._shade_together(part), ctx=None) for part in traced.split(MEASURED_RAYS_AT_ONCE)
+        )
+
+    def _shade_together(self, traced: TracedRays) -> ShadedRays:
         ramp, result = self.settings.shading_ramp(traced.training_progress), traced.result
         if ramp == 0:
             return ShadedRays(result.rgb_srgb, result.transmittance)

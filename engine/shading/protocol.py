@@ -7,8 +7,8 @@ gives (colors, transmittance, depths, normals, blended features), may trace furt
 Gaussians, and may have parameters of its own: of the views, or of the scene as a whole.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -51,6 +51,20 @@ class TracedRays:
         """Return whether a backward pass may follow: what was traced is recorded."""
         return self.result.recording is not None
 
+    def split(self, most: int) -> Iterator["TracedRays"]:
+        """Yield at most so many of the rays at a time, in order; they must not be recorded."""
+        assert not self.is_recorded
+        for start in range(0, len(self.rays), most):
+            part = slice(start, start + most)
+            yield replace(
+                self,
+                rays=self.rays[part],
+                result=self.result[part],
+                view=None if self.view is None else self.view[part],
+                dither=None if self.dither is None else self.dither[:, part],
+                ray_patches=None,
+            )
+
 
 @dataclass(frozen=True)
 class ShadedRays:
@@ -74,6 +88,16 @@ class ShadedRays:
         if not background_srgb.any():
             return self.rgb_srgb.copy()
         return self.rgb_srgb + self.transmittance[:, None] * background_srgb
+
+
+def concatenate_shaded(parts: Iterable[ShadedRays]) -> ShadedRays:
+    """Return shaded rays one after the other, for no backward pass; all parts have the same layers."""
+    kept = list(parts)
+    return ShadedRays(
+        np.concatenate([part.rgb_srgb for part in kept]),
+        np.concatenate([part.transmittance for part in kept]),
+        layers={name: np.concatenate([part.layers[name] for part in kept]) for name in kept[0].layers},
+    )
 
 
 class ShadedRayGradients(NamedTuple):

@@ -103,6 +103,18 @@ class TraceResult:
     hit_counts: Int32[np.ndarray, " r"]
     recording: "Recording | None" = None
 
+    def __getitem__(self, part: slice) -> "TraceResult":
+        """Return the result of consecutive rays, without a recording."""
+        return TraceResult(
+            rgb_srgb=self.rgb_srgb[part],
+            transmittance=self.transmittance[part],
+            depth_sum=self.depth_sum[part],
+            depth_median=self.depth_median[part],
+            normal_world=self.normal_world[part],
+            features=self.features[part],
+            hit_counts=self.hit_counts[part],
+        )
+
     @property
     def alpha(self) -> Float32[np.ndarray, " r"]:
         """Return the accumulated alpha in [0, 1]."""

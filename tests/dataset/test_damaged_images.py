@@ -8,7 +8,8 @@ import pytest
 
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.dataset import Dataset
-from octasplat.engine.dataset.damaged_images import MAX_NAMED
+from octasplat.engine.dataset.damaged_images import DECODING_BYTES, MAX_NAMED, decoding_workers
+from octasplat.engine.dataset.image_info import ImageInfo
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.render.image_files import write_png
 
@@ -78,3 +79,21 @@ def test_damaged_photographs_of_16_bits_are_named_at_once(photos: Path, tmp_path
         cut(path)
     told = refusal(photos, tmp_path)
     assert "2 images in" in told and all(path.name in told for path in images(photos)[2:4])
+
+
+@pytest.mark.parametrize(
+    ("info", "measured_bytes"),
+    [
+        (ImageInfo(4000, 3000, 8, False, 1, "8-bit"), 5 * 12e6),
+        (ImageInfo(4000, 3000, 16, False, 1, "16-bit"), 24 * 12e6),
+        (ImageInfo(4000, 3000, 8, True, 1, "8-bit"), 50 * 12e6),
+        (ImageInfo(4000, 3000, 16, True, 1, "16-bit"), 57 * 12e6),
+    ],
+)
+def test_photographs_that_are_decoded_side_by_side_share_bounded_memory(
+    info: ImageInfo, measured_bytes: float
+) -> None:
+    workers = decoding_workers(64, [info])
+    assert 0.25 * DECODING_BYTES < workers * measured_bytes <= DECODING_BYTES
+    assert decoding_workers(2, [ImageInfo(800, 600, 8, False, 1)]) == 2
+    assert decoding_workers(8, [ImageInfo(20_000, 15_000, 16, True, 1, "16-bit")]) == 1

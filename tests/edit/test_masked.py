@@ -1,9 +1,17 @@
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.edit.mask_selection import photograph_of_mask
+from octasplat.engine.core.rays import ImageRays, RayBatch
+from octasplat.engine.edit import mask_selection
+from octasplat.engine.edit.mask_selection import mostly_inside, photograph_of_mask
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.render.renderer import RECORDED_RAYS_PER_BATCH
+from octasplat.engine.trace.cpu.tracer import CpuTracer
+from octasplat.engine.trace.protocol import TraceResult
 
 PHOTOGRAPHS = ["0001.jpg", "left/0001.jpg", "right/0001.jpg", "right/0002.jpg", "right/0002.png", "far/9.jpg"]
 
@@ -34,3 +42,34 @@ def test_ambiguous_mask_is_refused() -> None:
         photograph_of_mask(Path("masks/right/0002.png"), PHOTOGRAPHS)
     with pytest.raises(ConfigError, match="no photograph of this name"):
         photograph_of_mask(Path("masks/0003.png"), PHOTOGRAPHS)
+
+
+class LargestBatchTracer(CpuTracer):
+    """A tracer that keeps the largest number of rays that it recorded at once."""
+
+    most_recorded = 0
+
+    def trace(self, rays: RayBatch, *, record: bool = False) -> TraceResult:
+        self.most_recorded = max(self.most_recorded, len(rays) if record else 0)
+        return super().trace(rays, record=record)
+
+
+def test_masks_of_large_views_record_some_rays_at_a_time(
+    make_scene: Callable[..., FlatGaussians], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A recorded ray takes some 20 KB."""
+    scene = make_scene(50, sh_degree=0, size=0.3)
+    x, y = np.meshgrid(np.linspace(-0.5, 0.5, 320), np.linspace(-0.5, 0.5, 240))
+    ways = np.stack([x, y, np.ones_like(x)], axis=-1)
+    image = ImageRays.from_directions(
+        np.array([0.0, 0.0, -3.0]), ways / np.linalg.norm(ways, axis=2, keepdims=True)
+    )
+    mask = np.asarray(x < 0.1)
+    assert min(mask.sum(), (~mask).sum()) < RECORDED_RAYS_PER_BATCH < mask.sum()
+    tracer = LargestBatchTracer(threads=1)
+    tracer.build(scene)
+    chosen = mostly_inside(tracer, len(scene), [(image, mask)])
+    assert 0 < tracer.most_recorded <= RECORDED_RAYS_PER_BATCH
+    monkeypatch.setattr(mask_selection, "RECORDED_RAYS_PER_BATCH", mask.size)
+    np.testing.assert_array_equal(mostly_inside(tracer, len(scene), [(image, mask)]), chosen)
+    assert 0 < chosen.sum() < len(scene)

@@ -7,6 +7,7 @@ import numpy as np
 
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
+from octasplat.engine.evaluate import held_out
 from octasplat.engine.evaluate.held_out import evaluate_held_out
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.render.image_files import read_image, write_png
@@ -54,12 +55,38 @@ def test_same_stem_photographs_get_own_renders(tmp_path):
         source.unlink()
         image.name = name
     model.write(root / "sparse" / "0")
-    held_out = ["a.png", "a.tif"]
-    data = Dataset.open(root, tmp_path / "cache", held_out=held_out)
+    names = ["a.png", "a.tif"]
+    data = Dataset.open(root, tmp_path / "cache", held_out=names)
     output = tmp_path / "out"
     evaluate(data, output, threads=1)
     assert sorted(path.name for path in (output / "renders").iterdir()) == ["a.png.png", "a.tif.png"]
-    assert sorted(json.loads((output / "metrics.json").read_text())["views"]) == held_out
+    assert sorted(json.loads((output / "metrics.json").read_text())["views"]) == names
+
+
+def test_large_views_are_measured_one_after_the_other_on_any_number_of_threads(tmp_path, monkeypatch):
+    """Each view takes some hundred bytes a pixel, while it is measured and while it waits for its turn."""
+    config = SyntheticDatasetConfig(views=6, width_px=40, height_px=30, samples_per_side=1, points=100)
+    write_synthetic_dataset(tmp_path / "scene", config)
+    data = Dataset.open(tmp_path / "scene", tmp_path / "cache", test_every=2)
+    rendered, most = 0, 0
+    render, measure = held_out.render_filtered, held_out.measure_view
+
+    def count_rendered(*arguments):
+        nonlocal rendered, most
+        rendered += 1
+        most = max(most, rendered)
+        return render(*arguments)
+
+    def count_measured(*arguments):
+        nonlocal rendered
+        rendered -= 1
+        return measure(*arguments)
+
+    monkeypatch.setattr(held_out, "render_filtered", count_rendered)
+    monkeypatch.setattr(held_out, "measure_view", count_measured)
+    monkeypatch.setattr(held_out, "MAX_PIXELS_AT_ONCE", 2 * 40 * 30 - 1)
+    evaluate(data, tmp_path / "out", threads=9)
+    assert most == 1 and rendered == 0
 
 
 def test_views_have_the_same_results_on_any_number_of_threads(tmp_path):

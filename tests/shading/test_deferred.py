@@ -10,6 +10,7 @@ from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.channels import stack_channels
 from octasplat.engine.gaussians.frames import frames_from_normals, quaternions_from_matrices
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
+from octasplat.engine.shading import deferred
 from octasplat.engine.shading.ambient_occlusion import ambient_visibility, diffuse_interreflection
 from octasplat.engine.shading.deferred import DeferredShading
 from octasplat.engine.shading.gbuffer import RayOffset
@@ -240,6 +241,40 @@ def test_views_that_are_only_measured_record_no_reflected_rays() -> None:
     learnt = model.shade(TracedRays(rays, tracer.trace(rays, record=True), tracer, views))
     assert tracer.recorded_rays > 3 * 8  # two from each point, and on from the other mirror
     np.testing.assert_array_equal(measured.rgb_srgb, learnt.rgb_srgb)
+
+
+def test_many_rays_that_are_only_measured_are_shaded_some_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A picture of 800 px has half a million rays, and each takes kilobytes with those that it sends on."""
+    mirrors = concatenate(
+        [wall((0, 0, 1), floor(1.0, 0.1, above=above), [1, 1, 1, 1, 0.3]) for above in (0.0, 1.0)]
+    )
+    model = DeferredShading(MaterialSettings(**BARE, up_world=(0, 0, 1)), extent_world=1.0)
+    model.light.set_radiance(np.random.default_rng(0).random((16, 32, 3), np.float32))
+    ways = np.random.default_rng(1).normal((0.0, 0.6, -0.8), 0.2, (1000, 3))
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    rays, tracer = RayBatch(np.array([[0, 0, 0.5]]), ways), LargestTraceTracer(threads=1)
+    tracer.build(mirrors, model.features(mirrors))
+    traced = TracedRays(rays, tracer.trace(rays), tracer, dither=np.random.default_rng(2).random((2, 1000)))
+    together = model.shade(traced)
+    monkeypatch.setattr(deferred, "MEASURED_RAYS_AT_ONCE", 128)
+    tracer.most_rays = 0
+    parts = model.shade(traced)
+    assert 128 < tracer.most_rays <= 2 * 128  # a pair from each point
+    np.testing.assert_array_equal(parts.rgb_srgb, together.rgb_srgb)
+    np.testing.assert_array_equal(parts.transmittance, together.transmittance)
+    assert parts.layers.keys() == together.layers.keys() != set()
+    for name, layer in together.layers.items():
+        np.testing.assert_array_equal(parts.layers[name], layer)
+
+
+class LargestTraceTracer(CpuTracer):
+    """A tracer that keeps the largest number of rays that it traced at once."""
+
+    most_rays = 0
+
+    def trace(self, rays: RayBatch, *, record: bool = False) -> TraceResult:
+        self.most_rays = max(self.most_rays, len(rays))
+        return super().trace(rays, record=record)
 
 
 def test_deferred_reflection_rays_skip_own_surface() -> None:

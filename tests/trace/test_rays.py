@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from octasplat.engine.core import rays as rays_module
 from octasplat.engine.core.rays import ImageRays, RayBatch, concatenate_rays
 from tests.support.trace_scenes import f32, unit
 
@@ -71,3 +72,29 @@ def test_rays_of_an_image_are_row_by_row(rng: np.random.Generator) -> None:
     assert image.origin_world.tolist() == [1, 2, 3] and image.rays.t_min.tolist() == [0.25]
     np.testing.assert_array_equal(image.rays.directions_world[4], directions[1, 1])
     np.testing.assert_array_equal(image.directions_world, directions)
+
+
+@pytest.mark.parametrize("shape", [(23, 17), (1, 9), (9, 1), (2, 3)])
+def test_rays_offset_some_rows_at_a_time_are_the_same(
+    shape: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What differences take in float64 is several times the rays of a large picture."""
+    ways = np.random.default_rng(0).normal((0, 0, 3), 1, (*shape, 3))
+    image = ImageRays.from_directions(
+        np.zeros(3), ways / np.linalg.norm(ways, axis=2, keepdims=True), 0.5, np.array([0.0, 0.0, 1.0])
+    )
+    together = image.shifted(0.25, -0.4)
+    assert not np.array_equal(together.directions_world, image.directions_world)
+    sizes: list[int] = []
+    shifted_ways = rays_module._shifted_ways
+
+    def counted(given: np.ndarray, across_px: float, down_px: float) -> np.ndarray:
+        sizes.append(len(given))
+        return shifted_ways(given, across_px, down_px)
+
+    monkeypatch.setattr(rays_module, "_shifted_ways", counted)
+    monkeypatch.setattr(rays_module, "SHIFTED_PIXELS_AT_ONCE", 2 * shape[1])
+    parts = image.shifted(0.25, -0.4)
+    assert max(sizes) <= 4
+    np.testing.assert_array_equal(parts.directions_world, together.directions_world)
+    assert parts.rays.t_min.tolist() == together.rays.t_min.tolist()
