@@ -378,16 +378,17 @@ def test_options_without_effect_on_cameras_are_warned_of(run, octasplat, tmp_pat
 
 
 def test_photographs_beside_a_file_are_refused(run, octasplat, tmp_path):
-    scene, picture = run.output / "scene.ply", tmp_path / "a.png"
+    scene, results = tmp_path / "scene.ply", tmp_path / "results"  # no scene of a run, which has photographs
+    shutil.copyfile(run.output / "scene.ply", scene)
     commands = (
-        ("render", scene, "--camera", 0, 0, -4, "-o", picture),
+        ("render", scene, "--camera", 0, 0, -4, "-o", results / "a.png"),
         ("info", scene),
-        ("stage", "init", scene, "-o", tmp_path / "stage.toml"),
+        ("stage", "init", scene, "-o", results / "stage.toml"),
     )
     for command in commands:
         refused = octasplat(*command, "--dataset", run.scene)
         assert refused.exit_code == 1 and "no folder of a run" in refused.stderr, refused.output
-    assert list(tmp_path.iterdir()) == []
+    assert list(tmp_path.iterdir()) == [scene]
 
 
 def test_preview_job_counts_pixels_of_one_image():

@@ -13,15 +13,16 @@ JOB = SimpleNamespace(id=uuid.UUID(int=1), queue="cpu")
 LIMITS = {"priority": 1, "max_file_bytes": 1}
 VIEW = SimpleNamespace(name="a.jpg", render="renders/a.png", width=4, height=3)
 MAP = SimpleNamespace(dataset_id=uuid.UUID(int=2), name="sky.hdr", title="")
-VALUES: dict[str, dict[str, Any]] = {
-    "_light.html": {"light": SimpleNamespace(views=[VIEW], **LIMITS)},
-    "_relight.html": {"relight": SimpleNamespace(views=["a.jpg"], maps=[MAP], learnt=None, **LIMITS)},
-}
+FORMS: list[tuple[str, dict[str, Any]]] = [
+    ("_light.html", {"light": SimpleNamespace(views=[VIEW], has_learnt_light=False, **LIMITS)}),
+    ("_light.html", {"light": SimpleNamespace(views=[VIEW], has_learnt_light=True, **LIMITS)}),
+    ("_relight.html", {"relight": SimpleNamespace(views=["a.jpg"], maps=[MAP], learnt=None, **LIMITS)}),
+]
 
 
-@pytest.mark.parametrize("template", list(VALUES))
-def test_fields_wait_for_choices_that_there_are(template: str) -> None:
-    page = render_template(template, job=JOB, base="/v1/jobs/1", **VALUES[template])
+@pytest.mark.parametrize(("template", "values"), FORMS, ids=["light", "learnt-light", "relight"])
+def test_fields_wait_for_choices_that_there_are(template: str, values: dict[str, Any]) -> None:
+    page = render_template(template, job=JOB, base="/v1/jobs/1", **values)
     choices = {
         name: re.findall(r'<option value="([^"]*)"', options)
         for name, options in re.findall(r'<select [^>]*name="(\w+)"[^>]*>(.*?)</select>', page, re.DOTALL)

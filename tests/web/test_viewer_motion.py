@@ -123,7 +123,8 @@ KEYS = [
     ("M", "KeyM", "measure"),
     ("m", "Semicolon", "measure"),  # of a French keyboard
     ("\u0442", "KeyN", "next"),  # of a Russian one
-    ("l", "KeyN", None),  # of a Dvorak keyboard, whose N lies elsewhere
+    ("b", "KeyN", "background"),  # of a Dvorak keyboard, whose N lies elsewhere
+    ("l", "KeyP", "materials"),
     ("+", "BracketRight", "nearer"),  # of a German keyboard
     ("-", "Slash", "farther"),
     ("=", "Equal", "nearer"),

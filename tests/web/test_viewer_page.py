@@ -46,8 +46,9 @@ def in_viewer(body: str, folder: Path, views: list[dict[str, Any]], before: str 
     files = {path.relative_to(STATIC).as_posix(): path for path in STATIC.rglob("*.js")}
     files |= {name: folder / name for name in ("scene.ply", "cameras.json")}
     page = render_template(
-        "viewer.html", name="a scene", page="/files/", size_bytes=1000, q=9.21, background="black"
-    )
+        "viewer.html", name="a scene", page="/files/", size_bytes=1000, q=9.21,
+        background="black", light="", up="null",
+    )  # fmt: skip
     page = re.sub(r"<script.*?</script>|<link .*?>", "", page).replace("</head>", f"{STYLE}</head>")
     for name, value in box.items():
         page = re.sub(f' data-{name}="[^"]*"', f' data-{name}="{value}"', page)
