@@ -85,7 +85,13 @@ def choose_light(source: Path, gaussians: FlatGaussians, stage: Stage | None = N
     is_lit = stage is not None and stage.environment is not None
     if not is_lit and not (materials.learn and run_environment(run).exists()):
         return SceneLight(reason="the run holds no light that its materials were learnt in.")
-    if material_shading(materials.recipe).albedo_holds_light:
+    shading = material_shading(materials.recipe)
+    if shading.matt_color_is_harmonics:
+        return SceneLight(
+            reason=f"with materials.recipe={materials.recipe} what is matt has its color from the harmonics, "
+            "which a stage does not light, and its light is in display values."
+        )
+    if shading.albedo_holds_light:
         return SceneLight(
             reason=f"with materials.recipe={materials.recipe} base colors hold the light of the photographs, "
             "which a stage would add once more."

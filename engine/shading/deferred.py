@@ -73,6 +73,8 @@ class DeferredShading:
         harmonics_are_shaded: whether the harmonics learn the shaded colors, so that they can be computed
             from materials and light.
         albedo_holds_light: whether the base color of what is matt is the color that photographs show.
+        matt_color_is_harmonics: whether what is matt has its color from the harmonics, and none from the base
+            color.
         light: the environment.
         frame: its right, up and forward in the world, as rows.
     """
@@ -80,6 +82,7 @@ class DeferredShading:
     name = "materials"
     harmonics_are_shaded: ClassVar[bool] = True
     albedo_holds_light: ClassVar[bool] = False
+    matt_color_is_harmonics: ClassVar[bool] = False
 
     def __init__(self, settings: MaterialSettings, *, extent_world: float, one_sided: bool = False) -> None:
         self.settings = settings

@@ -8,6 +8,7 @@ as there: the first stage shades pixels, not Gaussians, and visibility comes fro
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -52,7 +53,8 @@ PROPAGATION_NOISE = 0.4
 class RefGaussianShading(DeferredShading):
     """Deferred shading as in the code of Reflective Gaussian Splatting."""
 
-    harmonics_are_shaded = False
+    harmonics_are_shaded: ClassVar[bool] = False
+    matt_color_is_harmonics: ClassVar[bool] = True
 
     def __init__(self, settings: MaterialSettings, *, extent_world: float, one_sided: bool = False) -> None:
         super().__init__(settings, extent_world=extent_world, one_sided=one_sided)

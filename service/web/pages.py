@@ -278,12 +278,13 @@ def _up_world(config: dict[str, object]) -> str:
 def _shows_materials(config: dict[str, object]) -> bool:
     """Return whether the 3D view and stages show the materials of a result, as ``octasplat view`` decides it.
 
-    Where base colors hold the light of a room, light from far away cannot show them.
+    Where base colors hold the light of a room, light from far away cannot show them; nor what is matt, where
+    it has its color from the harmonics.
     """
     recipe = _config_value(config, "reconstruction", "train", "materials", "recipe")
     return (
         bool(_config_value(config, "reconstruction", "train", "materials", "learn"))
-        and recipe != "near_field"
+        and recipe in (None, "split_sum")  # ref_gaussian has a former name, too
     )
 
 

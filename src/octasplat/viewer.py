@@ -169,21 +169,22 @@ def _shown_light(scene: Scene, shading: Shading | None) -> "DeferredShading | No
     """Return the shading whose light materials are shown in; None for harmonics.
 
     Raises:
-        ConfigError: materials are asked for, and their light is not known, or it is that of a room.
+        ConfigError: materials are asked for, and their light is not known, or does not show them.
     """
     if shading not in (None, "materials", "harmonics"):
         raise ConfigError(f"shading: {shading!r} is neither 'materials' nor 'harmonics'.")
     if shading == "harmonics":
         return None
     found = scene.materials if has_materials(scene.gaussians) else None
-    if found is not None and not found.albedo_holds_light:
+    if found is None:
+        why = "holds no light that materials were learnt in"
+    elif found.albedo_holds_light:
+        why = "has base colors with the light of the photographs, which light from far away cannot show"
+    elif found.matt_color_is_harmonics:
+        why = "has the color of what is matt from the harmonics, which no light of the page changes"
+    else:
         return found
     if shading == "materials":
-        why = (
-            "holds no light that materials were learnt in"
-            if found is None
-            else "has base colors with the light of the photographs, which light from far away cannot show"
-        )
         raise ConfigError(f"shading: the scene {why}; leave it out to see harmonics.")
     return None
 

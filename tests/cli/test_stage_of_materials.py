@@ -101,16 +101,18 @@ def spoil_run(lit_run: Path, folder: Path, case: str) -> tuple[Path, str]:
             values[0] = 0
         write_gaussian_ply(gaussians, run / "scene.ply")
         return run, "some of its Gaussians came from a scene without"
-    if case == "near_field":
-        text = (run / "config.json").read_text().replace('"recipe": "split_sum"', '"recipe": "near_field"')
+    if case in ("near_field", "ref_gaussian"):
+        text = (run / "config.json").read_text().replace('"recipe": "split_sum"', f'"recipe": "{case}"')
         (run / "config.json").write_text(text)
+        if case == "ref_gaussian":
+            return run, "what is matt has its color from the harmonics"
         return run, "base colors hold the light of the photographs"
     for path in run.glob("environment.*"):
         path.unlink()
     return run, "the run holds no light"
 
 
-@pytest.mark.parametrize("case", ["file", "some", "near_field", "no_map"])
+@pytest.mark.parametrize("case", ["file", "some", "near_field", "ref_gaussian", "no_map"])
 def test_stage_init_says_why_materials_are_not_shown(lit_run, octasplat, tmp_path, case):
     source, words = spoil_run(lit_run, tmp_path, case)
     done = octasplat("stage", "init", source, "-o", tmp_path / "stage.toml")

@@ -114,7 +114,7 @@ def test_render_in_the_learnt_light_goes_on_elsewhere_but_not_in_another_light(l
     assert len(list((tmp_path / "views").glob("*.png"))) == 2
 
 
-@pytest.mark.parametrize("case", ["file", "some", "near_field", "no_map", "only_shadows"])
+@pytest.mark.parametrize("case", ["file", "some", "near_field", "ref_gaussian", "no_map", "only_shadows"])
 def test_one_line_says_why_materials_are_not_shown(lit_run, picture, tmp_path, case):
     lamp = ""
     if case == "only_shadows":

@@ -106,6 +106,19 @@ def each_enters(boxes, origins, directions, t_max):  # type: ignore[no-untyped-d
     return found
 
 
+@pytest.mark.parametrize("distance", [1.0, 1e4, 1e9, 1e15])
+def test_rays_along_an_axis_enter_boxes_however_far_they_start(distance: float) -> None:
+    box = np.float32([[-0.5, -0.5, -0.5, 0.5, 0.5, 0.5]]).T
+    beside, zeros = np.linspace(-0.499, 0.499, 5), np.zeros(25)
+    across, along = (part.ravel() for part in np.meshgrid(beside, beside))
+    for axis in range(3):
+        for way in (-1.0, 1.0):
+            origins = np.roll(np.stack([zeros - way * distance, across, along], axis=1), axis, axis=1)
+            directions = np.roll(np.stack([zeros + way, zeros, zeros], axis=1), axis, axis=1)
+            rays = origins.astype(np.float32), directions.astype(np.float32)
+            assert each_enters(box, *rays, np.full(25, np.inf, np.float32)).all()
+
+
 def test_rays_that_enter_boxes_are_found() -> None:
     rng = np.random.default_rng(5)
     low = rng.uniform(-3, 3, (20, 3))

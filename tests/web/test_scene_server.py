@@ -95,7 +95,11 @@ def test_materials_are_served_in_the_light_that_was_learnt() -> None:
 
 
 def test_materials_that_cannot_be_shown_are_not(scene: osp.Scene) -> None:
-    for other, words in ((scene, "holds no light"), (lit_scene("near_field"), "light of the photographs")):
+    for other, words in (
+        (scene, "holds no light"),
+        (lit_scene("near_field"), "light of the photographs"),
+        (lit_scene("ref_gaussian"), "from the harmonics"),
+    ):
         with osp.view(other, open_browser=False) as viewer:
             assert b"data-light" not in get(viewer.url, "")[2]
         with pytest.raises(ConfigError, match=words):

@@ -13,7 +13,7 @@ from octasplat.engine.pathtracing.kernels.path_args import PATH_ENDED, Bounce
 from octasplat.engine.trace.kernels.native import njit_no_refcount
 
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
-_LEAST_SLOPE = np.float32(1e-12)
+_LEAST_SLOPE = np.float32(1e-20)
 """Rays along a box's side count as this steep, so that nothing is divided by zero."""
 _NEARER, _FARTHER = np.float32(1.0 - 1e-6), np.float32(1.0 + 1e-6)
 """More than float32 rounds off distances along rays."""
