@@ -10,6 +10,7 @@ from pydantic import Field
 
 from octasplat.engine.core.errors import OutputError
 from octasplat.engine.core.events import EventListener, Noted, Warned, ignore_events
+from octasplat.engine.core.writing import atomic_replace
 from octasplat.engine.operations.axes import Axis, axis_named
 from octasplat.engine.operations.base import Operation, Options, Result, WritingRequest, never_stop, stop_if
 from octasplat.engine.operations.render_options import UP_OF_RUN_UNUSED, Point
@@ -106,8 +107,14 @@ def run(
         if request.copy_light and light.environment is not None:
             original, beside = output.parent / light.environment, output.parent / Path(light.environment).name
             if beside.resolve() != original.resolve():
+                if run_around(output.parent) is not None:
+                    raise OutputError(
+                        f"The light of {source} would take the place of that of the run {output.parent}; "
+                        "write the stage into another folder, or leave out --copy-light."
+                    )
                 check_targets("stage-init", [beside], [request.source], overwrite=request.overwrite)
-                shutil.copyfile(original, beside)
+                with atomic_replace(beside) as partial:
+                    shutil.copyfile(original, partial)
                 files.append(beside)
             light = replace(light, environment=beside.name)
         write_stage_template(output, facts, light)

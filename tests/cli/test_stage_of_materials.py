@@ -73,6 +73,17 @@ def test_stage_init_puts_the_light_beside_the_stage_when_asked(lit_run, octaspla
     assert (tmp_path / "environment.exr").read_bytes() == b"mine"
 
 
+def test_stage_init_keeps_the_light_of_another_run(lit_run, octasplat, tmp_path):
+    other = tmp_path / "other"
+    shutil.copytree(lit_run, other)
+    (other / "environment.exr").write_bytes(b"of the other run")
+    command = ("stage", "init", lit_run, "-o", other / "stage.toml", "--copy-light", "--overwrite")
+    refused = octasplat(*command)
+    assert refused.exit_code == 1 and "would take the place of that of the run" in refused.stderr
+    assert (other / "environment.exr").read_bytes() == b"of the other run"
+    assert not (other / "stage.toml").exists()
+
+
 def test_stage_init_job_puts_the_light_beside_the_stage(lit_run, tmp_path):
     results = results_of("stage-init", lit_run, tmp_path / "attempt", {})
     assert {path.name for path in results.iterdir()} == {"stage.toml", "environment.exr"}
