@@ -38,7 +38,8 @@ STAGE_IS_OPAQUE = (
 STAGE_LACKS_MATERIALS = (
     "The scene's materials are left out on this stage, and its harmonics shown, which have no sharp "
     'reflections; light = "relit" of [[gaussians]] shows materials in the light of the stage, such as the '
-    "environment.exr of a run (whose up is its materials.up_world): octasplat stage init writes both where it can be lit."
+    "environment.exr of a run (whose up is its materials.up_world): octasplat stage init writes both where "
+    "materials can be lit."
 )
 EMISSIVE_TAKES_NO_LIGHT = (
     'takes no light of it: all Gaussians of this stage have light = "emissive", so that it lights meshes '
