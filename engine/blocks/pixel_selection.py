@@ -7,7 +7,8 @@ from jaxtyping import Bool, Float64, Int64
 
 from octasplat.engine.dataset.view_tiles import FULL_FREQUENCY, Rectangles, ViewTiles
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.trace.protocol import TraceGradients, Tracer
+from octasplat.engine.trace.protocol import Tracer
+from octasplat.engine.trace.weight_sums import blend_weight_sums
 from octasplat.engine.train.sampling.pixel_sampler import TrainingData
 
 MIN_CONTRIBUTION = 0.05
@@ -40,11 +41,8 @@ def seen_pixels(
     for tiles in tiles_of_views(dataset):
         pixels = tiles.pixels()
         view = dataset.views[tiles.view]
-        traced = tracer.trace(dataset.rays(*pixels), record=True)
-        assert traced.recording is not None
-        # backward of zeros: only the sums of weights are wanted
-        found = tracer.backward(traced.recording, TraceGradients(np.zeros_like(traced.rgb_srgb))).numpy()
-        sums[found.ids] += found.weight_sums * (view.width_px * view.height_px / len(pixels[0]))
+        weights = blend_weight_sums(tracer, dataset.rays(*pixels), len(gaussians))
+        sums += weights * (view.width_px * view.height_px / len(pixels[0]))
         on_view()
     return sums
 

@@ -4,19 +4,20 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Int64
 
 from octasplat.engine.core.errors import ConfigError, DatasetError
-from octasplat.engine.core.rays import ImageRays, RayBatch
+from octasplat.engine.core.rays import ImageRays
 from octasplat.engine.dataset.model import Viewpoints
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.render.image_files import read_image
-from octasplat.engine.render.renderer import RECORDED_RAYS_PER_BATCH, tile_order
+from octasplat.engine.render.renderer import tile_order
 from octasplat.engine.render.shots import view_shots
 from octasplat.engine.runs.config import read_config
 from octasplat.engine.runs.run_folder import CONFIG, is_full_run, run_min_view_distance, run_viewpoints
 from octasplat.engine.trace.factory import make_tracer
-from octasplat.engine.trace.protocol import TraceGradients, Tracer
+from octasplat.engine.trace.protocol import Tracer
+from octasplat.engine.trace.weight_sums import blend_weight_sums
 
 MASK_THRESHOLD = 0.5
 
@@ -62,22 +63,9 @@ def mostly_inside(
     for image, mask in views:
         order = tile_order(image.height_px, image.width_px)
         meant = mask.ravel()[order]
-        inside += _blend_weights(tracer, image.rays[order[meant]], count)
-        outside += _blend_weights(tracer, image.rays[order[~meant]], count)
+        inside += blend_weight_sums(tracer, image.rays[order[meant]], count)
+        outside += blend_weight_sums(tracer, image.rays[order[~meant]], count)
     return np.asarray(inside > outside)
-
-
-def _blend_weights(tracer: Tracer, rays: RayBatch, count: int) -> Float64[np.ndarray, " n"]:
-    """Return the summed blending weight of each Gaussian over rays."""
-    sums = np.zeros(count)
-    for start in range(0, len(rays), RECORDED_RAYS_PER_BATCH):
-        traced = tracer.trace(rays[start : start + RECORDED_RAYS_PER_BATCH], record=True)
-        assert traced.recording is not None
-        # Without gradients: only the sums of the blending weights are wanted.
-        found = tracer.backward(traced.recording, TraceGradients(np.zeros_like(traced.rgb_srgb))).numpy()
-        sums[found.ids] += found.weight_sums
-        del traced, found  # the recording's memory serves the next one
-    return sums
 
 
 def _rays_of_masked_view(viewpoints: Viewpoints, path: Path, near_world: float) -> ImageRays:

@@ -13,11 +13,9 @@ from octasplat.engine.shading.plain import PLAIN_SHADING
 from octasplat.engine.shading.protocol import ShadingModel, TracedRays
 from octasplat.engine.trace import ray_hits
 from octasplat.engine.trace.facing_normals import face_viewer
-from octasplat.engine.trace.protocol import Tracer
+from octasplat.engine.trace.protocol import RECORDED_RAYS_PER_BATCH, Tracer
 
 RAYS_PER_BATCH = 1 << 18
-RECORDED_RAYS_PER_BATCH = 1 << 15
-"""Rays at once where their hits are kept: each has room for all that it could meet."""
 FRONT_DEPTH_TOLERANCE = 0.005
 """What lies farther behind the median depth than this share of it is another surface."""
 STEPS = np.array([0.7548776662466927, 0.5698402909980532])

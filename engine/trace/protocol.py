@@ -14,6 +14,9 @@ from octasplat.engine.settings import renamed_settings
 from octasplat.engine.settings.base import FormerSetting, Settings
 from octasplat.engine.settings.fields import ADVANCED, EXPERIMENTAL, Unit
 
+RECORDED_RAYS_PER_BATCH = 1 << 15
+"""Rays at once where their hits are kept: each has room for all that it could meet."""
+
 
 class TraceSettings(Settings):
     """Choice of the tracer and its limits; where a ray begins is a property of the ray."""

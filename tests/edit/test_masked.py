@@ -6,12 +6,11 @@ import pytest
 
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.rays import ImageRays, RayBatch
-from octasplat.engine.edit import mask_selection
 from octasplat.engine.edit.mask_selection import mostly_inside, photograph_of_mask
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.render.renderer import RECORDED_RAYS_PER_BATCH
+from octasplat.engine.trace import weight_sums
 from octasplat.engine.trace.cpu.tracer import CpuTracer
-from octasplat.engine.trace.protocol import TraceResult
+from octasplat.engine.trace.protocol import RECORDED_RAYS_PER_BATCH, TraceResult
 
 PHOTOGRAPHS = ["0001.jpg", "left/0001.jpg", "right/0001.jpg", "right/0002.jpg", "right/0002.png", "far/9.jpg"]
 
@@ -70,6 +69,6 @@ def test_masks_of_large_views_record_some_rays_at_a_time(
     tracer.build(scene)
     chosen = mostly_inside(tracer, len(scene), [(image, mask)])
     assert 0 < tracer.most_recorded <= RECORDED_RAYS_PER_BATCH
-    monkeypatch.setattr(mask_selection, "RECORDED_RAYS_PER_BATCH", mask.size)
+    monkeypatch.setattr(weight_sums, "RECORDED_RAYS_PER_BATCH", mask.size)
     np.testing.assert_array_equal(mostly_inside(tracer, len(scene), [(image, mask)]), chosen)
     assert 0 < chosen.sum() < len(scene)
